@@ -38,7 +38,7 @@ from tests.servers.http import http_server
 SLOW = pytest.mark.slow
 
 
-def hash_arrays(arrays: Iterable[np.ndarray]) -> bytes:
+def digest(arrays: Iterable[np.ndarray]) -> bytes:
     found = hashlib.blake2b()
     for array in arrays:
         found.update(f"{array.dtype} {array.shape}".encode() + array.tobytes())
@@ -52,9 +52,7 @@ def hash_batches(dataset: Dataset) -> bytes:
         samplers.append(part.ad(batch_size=8, length=20, teammate_actions=True))
         samplers.append(part.ad(batch_size=4, length=7, seed=1, episodes=(1, 4)))
         samplers.append(part.dpt(batch_size=4, context=20))
-    return hash_arrays(
-        array for sampler in samplers for array in sampler.batch(3)._asdict().values() if array is not None
-    )
+    return digest(array for sampler in samplers for array in sampler.batch(3)._asdict().values() if array is not None)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +88,7 @@ class DamagedCopy:
         """Return a hash of all arrays and of batches, and the metadata as text."""
         dataset = load_icrl4aht(root, obs="uint8", cache=cache, threads=1)
         names = {h: [one.name for one in held_fields(dataset.info.kind) if h.entry.has(one)] for h in dataset}
-        arrays = hash_arrays(itertools.chain.from_iterable([h.obs[:], *map(h.read, names[h])] for h in names))
+        arrays = digest(itertools.chain.from_iterable([h.obs[:], *map(h.read, names[h])] for h in names))
         histories = [(repr(h.entry), dataset.recover_teammate(h.entry.history_id)) for h in dataset]
         return arrays + hash_batches(dataset), f"{histories} {dataset.info}"
 
@@ -152,9 +150,7 @@ def mutate(data: bytes, rng: np.random.Generator) -> bytes:
 
 @pytest.mark.parametrize("name", [HISTORIES, INFO, MANIFEST, TASKS, PROVENANCE])
 @pytest.mark.parametrize("count", [1, pytest.param(10, marks=SLOW)])
-def test_mutated_text_files_raise_package_errors_in_bounded_time_and_memory(
-    small_release, cache_folder, tmp_path, name, count
-):
+def test_mutated_text_files_raise_only_package_errors(small_release, cache_folder, tmp_path, name, count):
     """Read each mutated file with the old manifest, then with a matching manifest."""
     path, rng = small_release.root / name, np.random.default_rng(count)
     for number in range(count):

@@ -22,50 +22,46 @@ from tests.robustness.limits import time_limit
 
 
 @pytest.fixture(scope="module")
-def learned_ppo(tmp_path_factory) -> Path:
+def release(tmp_path_factory) -> Path:
     """Return a release of the bundled PPO histories of one task with a learned teammate (read-only)."""
     dataset = load_icrl4aht(source="ppo", teammate_kind="fcp")
     return to_release(dataset.filter(task_id=dataset.entries[0].task_id), tmp_path_factory.mktemp("meta") / "r", "lite")
 
 
-def first_of(content: dict[str, Any]) -> dict[str, Any]:
+def first(content: dict[str, Any]) -> dict[str, Any]:
     return next(iter(content.values()))
 
 
-def test_verify_accepts_the_undamaged_release(learned_ppo):
-    assert problems(learned_ppo, "quick") == problems(learned_ppo, "deep") == []
+def test_verify_accepts_the_undamaged_release(release):
+    assert problems(release, "quick") == problems(release, "deep") == []
 
 
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        (
-            PROVENANCE,
-            lambda c: first_of(c)["teammate"].update(kind="heuristic"),
-            "Object contains unknown field `kind`",
-        ),
-        (PROVENANCE, lambda c: c.update(more=first_of(c)), "task 'more': has no history"),
+        (PROVENANCE, lambda c: first(c)["teammate"].update(kind="heuristic"), "Object contains unknown field `kind`"),
+        (PROVENANCE, lambda c: c.update(more=first(c)), "task 'more': has no history"),
         (PROVENANCE, lambda c: c.pop(next(iter(c))), "': missing"),
-        (PROVENANCE, lambda c: first_of(c).update(seed=77), "seed: expected the task's"),
-        (PROVENANCE, lambda c: first_of(c)["ego"].update(clip=0.3), "ego_hash: expected"),
+        (PROVENANCE, lambda c: first(c).update(seed=77), "seed: expected the task's"),
+        (PROVENANCE, lambda c: first(c)["ego"].update(clip=0.3), "ego_hash: expected"),
         (
             PROVENANCE,
-            lambda c: first_of(c).update(streams_recorded=17),
+            lambda c: first(c).update(streams_recorded=17),
             "streams_recorded: expected {total}, {environments} of each of 2 learners, found 17",
         ),
         (
             PROVENANCE,
-            lambda c: first_of(c).update(streams_kept=9999),
+            lambda c: first(c).update(streams_kept=9999),
             "streams_kept: expected at most the {recorded} recorded",
         ),
         (
             PROVENANCE,
-            lambda c: first_of(c)["filter"]["after"].update(return_end=9.0),
+            lambda c: first(c)["filter"]["after"].update(return_end=9.0),
             "filter.after.return_end: exp",
         ),
         (
             PROVENANCE,
-            lambda c: [names.__setitem__(0, "brdiv") for names in first_of(c)["suite"]["algorithms"].values()],
+            lambda c: [names.__setitem__(0, "brdiv") for names in first(c)["suite"]["algorithms"].values()],
             "but the teammate is of fcp",
         ),
         (HISTORIES, lambda c: c[-1].update(env_idx=-1), "Expected `int` >= 0"),
@@ -77,25 +73,23 @@ def test_verify_accepts_the_undamaged_release(learned_ppo):
         (HISTORIES, lambda c: c[-1].update(source="human"), "source: expected 'human' as in the index, found 'ppo'"),
         (HISTORIES, lambda c: [line.update(teammate_kind="territory") for line in c], "'territory' is of another fam"),
         (INFO, lambda c: c.update(data_version="../.."), "data version '../..': expected one such as 1.0.0"),
-        (INFO, lambda c: first_of(c["statistics"]).update(disk_bytes=1), "statistics: expected"),
+        (INFO, lambda c: first(c["statistics"]).update(disk_bytes=1), "statistics: expected"),
     ],
 )
-def test_verify_finds_false_values_in_meta_files(learned_ppo, tmp_path, name, change, message):
-    dataset = load_icrl4aht(learned_ppo)
-    (note,) = read_provenance(learned_ppo / PROVENANCE).values()
+def test_verify_finds_false_values_in_meta_files(release, tmp_path, name, change, message):
+    dataset = load_icrl4aht(release)
+    (note,) = read_provenance(release / PROVENANCE).values()
     assert note.ego is not None
     environments = note.ego["environments"]
     numbers = {"recorded": note.streams_recorded, "environments": environments, "total": 2 * environments}
     message = message.format(stored=len(dataset), **numbers)
-    found = problems(spoiled(learned_ppo, tmp_path / "release", name, change), "quick")
+    found = problems(spoiled(release, tmp_path / "release", name, change), "quick")
     assert any(message in problem for problem in found), found
 
 
-def test_teammate_field_in_provenance_is_refused(learned_ppo, tmp_path):
+def test_teammate_field_in_provenance_is_refused(release, tmp_path):
     """Regression: a teammate in provenance.json once replaced the teammate stored with the task."""
-    root = spoiled(
-        learned_ppo, tmp_path / "release", PROVENANCE, lambda c: first_of(c)["teammate"].update(family="brdiv")
-    )
+    root = spoiled(release, tmp_path / "release", PROVENANCE, lambda c: first(c)["teammate"].update(family="brdiv"))
     with pytest.raises(IndexFormatError, match="unknown field `family`"):
         load_icrl4aht(root).recover_teammate(0)
 
@@ -116,9 +110,9 @@ def test_verify_finds_false_values_in_a_release_without_tasks(converted_release,
         assert any(message in problem for problem in found), found
 
 
-def test_verify_finds_unreferenced_shards_and_policies(learned_ppo, tmp_path):
+def test_verify_finds_unreferenced_shards_and_policies(release, tmp_path):
     root = tmp_path / "release"
-    shutil.copytree(learned_ppo, root)
+    shutil.copytree(release, root)
     policy = next(root.glob("teammates/*"))
     shutil.copytree(policy, policy.with_name("0" * 64))
     shard = next(root.rglob("*.h5"))

@@ -129,21 +129,13 @@ def test_published_files_omit_oracle_actions_and_learner_numbers(lite_mixed, tmp
         (HISTORIES, lambda c: c[0].update(has_oracle_actions=False), "the index implies"),
         (
             PROVENANCE,
-            lambda c: last_of(c).update(streams_recorded=2),
+            lambda c: last(c).update(streams_recorded=2),
             "expected 4, 2 of each of 2 learners, found 2",
         ),
-        (PROVENANCE, lambda c: first_of(c)["noise"].update(episodes=6), "noise.episodes: expected the 5 of history 0"),
-        (
-            PROVENANCE,
-            lambda c: first_of(c)["noise"].update(end=[0.2, 0.1]),
-            "noise.end: expected a range [least, most]",
-        ),
-        (PROVENANCE, lambda c: first_of(c)["nearest_test"].update(teammate="\x1b[2J"), "printable characters"),
-        (
-            PROVENANCE,
-            lambda c: first_of(c)["expert"].update(policy_sha256="0" * 64),
-            "the script labels noise histories",
-        ),
+        (PROVENANCE, lambda c: first(c)["noise"].update(episodes=6), "noise.episodes: expected the 5 of history 0"),
+        (PROVENANCE, lambda c: first(c)["noise"].update(end=[0.2, 0.1]), "noise.end: expected a range [least, most]"),
+        (PROVENANCE, lambda c: first(c)["nearest_test"].update(teammate="\x1b[2J"), "printable characters"),
+        (PROVENANCE, lambda c: first(c)["expert"].update(policy_sha256="0" * 64), "the script labels noise histories"),
     ],
 )
 def test_verify_finds_false_learners_sources_and_provenance(lite_mixed, tmp_path, name, change, message):
@@ -151,11 +143,11 @@ def test_verify_finds_false_learners_sources_and_provenance(lite_mixed, tmp_path
     assert message in found
 
 
-def first_of(content: dict[str, Any]) -> dict[str, Any]:
+def first(content: dict[str, Any]) -> dict[str, Any]:
     return next(iter(content.values()))
 
 
-def last_of(content: dict[str, Any]) -> dict[str, Any]:
+def last(content: dict[str, Any]) -> dict[str, Any]:
     return list(content.values())[-1]
 
 

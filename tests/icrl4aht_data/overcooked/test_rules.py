@@ -52,9 +52,7 @@ class Scene(NamedTuple):
     shaped: list[float]
 
 
-def scene_after(
-    layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, next_recipe: int = RECIPE_111
-) -> Scene:
+def act(layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, next_recipe: int = RECIPE_111) -> Scene:
     """Return the scene after one step; a correct delivery changes the recipe to `next_recipe`."""
     after = rules.step(layout, record, np.array([[ego, teammate]]), np.array([next_recipe], np.uint8))
     state = unpack(layout, after.state)
@@ -75,9 +73,7 @@ def slot(request: pytest.FixtureRequest) -> int:
     return request.param
 
 
-def agent_scene(
-    slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Pose = ASIDE, **fields
-) -> np.ndarray:
+def scene(slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Pose = ASIDE, **fields) -> np.ndarray:
     """Return a state with one agent at pose `at` holding item `hand`, and the other agent out of the way."""
     if slot == 0:
         return state_record(layout, at, aside, hands=[hand, 0], **fields)
@@ -89,7 +85,7 @@ def after_action(
 ) -> Scene:
     """Return the scene after one step in which agent `slot` acts and the other agent stays."""
     ego, teammate = (action, STAY) if slot == 0 else (STAY, action)
-    return scene_after(layout, record, ego, teammate, next_recipe)
+    return act(layout, record, ego, teammate, next_recipe)
 
 
 def interact(slot: int, record: np.ndarray, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111) -> Scene:
@@ -134,18 +130,18 @@ def test_agents_move_as_specified_from_every_pair_of_cells(layout):
 
 
 def test_pot_with_three_ingredients_cooks_for_20_steps(slot):
-    record = agent_scene(slot, AT_POT, ZERO)
+    record = scene(slot, AT_POT, ZERO)
     for content in (ZERO, 2 * ZERO):
         after = interact(slot, record)
         assert (after.pots, after.hands) == ([(content, 0)], [0, 0])
-        assert scene_after(CRAMPED, after.record, STAY).pots == [(content, 0)]  # two ingredients do not start cooking
+        assert act(CRAMPED, after.record, STAY).pots == [(content, 0)]  # two ingredients do not start cooking
         record = after.record.copy()
         record[:, columns(CRAMPED).hands.start + slot] = ZERO
     after = interact(slot, record)
     timeline = []
     for _ in range(21):
         timeline.append((*after.pots[0], int(observe(CRAMPED, after.record, slot)[0, 1, 2, -1])))
-        after = scene_after(CRAMPED, after.record, STAY)
+        after = act(CRAMPED, after.record, STAY)
     cooking = [(RECIPE_000, timer, timer) for timer in range(19, 0, -1)]
     assert timeline == [*cooking, (SOUP_000, 0, 0), (SOUP_000, 0, 0)]
 
@@ -155,16 +151,16 @@ def test_pot_with_three_ingredients_cooks_for_20_steps(slot):
 
 @pytest.mark.parametrize("next_recipe", [RECIPE_000, RECIPE_111])
 def test_a_correct_delivery_pays_20_and_changes_the_recipe(slot, next_recipe):
-    after = interact(slot, agent_scene(slot, AT_GOAL, DISH_000, recipe=RECIPE_000), next_recipe=next_recipe)
+    after = interact(slot, scene(slot, AT_GOAL, DISH_000, recipe=RECIPE_000), next_recipe=next_recipe)
     assert (after.reward, after.shaped, after.hands) == (20, [0, 0], [0, 0])
     assert (after.recipe, after.delivered) == (next_recipe, 1)  # the next recipe may equal the delivered recipe
-    later = scene_after(CRAMPED, after.record, STAY, next_recipe=RECIPE_001)
+    later = act(CRAMPED, after.record, STAY, next_recipe=RECIPE_001)
     assert (later.delivered, later.recipe, later.reward) == (0, next_recipe, 0)
 
 
 @pytest.mark.parametrize(("recipe", "dish"), [(RECIPE_000, DISH_111), (RECIPE_111, DISH_000), (RECIPE_000, DISH_001)])
 def test_a_wrong_delivery_costs_20_and_keeps_the_recipe(slot, recipe, dish):
-    after = interact(slot, agent_scene(slot, AT_GOAL, dish, recipe=recipe), next_recipe=RECIPE_001)
+    after = interact(slot, scene(slot, AT_GOAL, dish, recipe=recipe), next_recipe=RECIPE_001)
     assert (after.reward, after.shaped, after.hands) == (-20, [0, 0], [0, 0])
     assert (after.recipe, after.delivered) == (recipe, 0)
 
@@ -176,7 +172,7 @@ FAR = ((1, 4, "up"), (3, 5, "up"))
 
 
 def ring_scene(slot: int, hand: int = 0, **fields) -> np.ndarray:
-    return agent_scene(slot, AT_BUTTON[slot], hand, layout=RING, aside=FAR[1 - slot], **fields)
+    return scene(slot, AT_BUTTON[slot], hand, layout=RING, aside=FAR[1 - slot], **fields)
 
 
 def test_button_press_costs_5_and_shows_the_recipe_for_9_observations(slot):
@@ -189,7 +185,7 @@ def test_button_press_costs_5_and_shows_the_recipe_for_9_observations(slot):
     for _ in range(11):
         timers.append(after.buttons)
         visible.append(int(observe(RING, after.record, slot)[0, row, 2, recipe_channel]))
-        after = scene_after(RING, after.record, STAY)
+        after = act(RING, after.record, STAY)
         assert after.reward == 0
     assert timers == [[timer, 0] for timer in (9, 8, 7, 6, 5, 4, 3, 2, 1, 0, 0)]
     assert visible == [3] * 9 + [0, 0]
@@ -212,7 +208,7 @@ def test_button_press_costs_5_and_shows_the_recipe_for_9_observations(slot):
 )
 def test_ego_interacts_before_the_teammate_at_a_shared_pot(hands, pot, hands_after, pot_after):
     record = state_record(ASYMM, (3, 2, "right"), (5, 2, "left"), hands=hands, pot_items=[pot, 0])
-    after = scene_after(ASYMM, record, INTERACT, INTERACT)
+    after = act(ASYMM, record, INTERACT, INTERACT)
     assert (after.hands, after.pots) == (hands_after, [pot_after, (0, 0)])
 
 

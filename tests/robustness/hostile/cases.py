@@ -55,7 +55,7 @@ def add_line(name: str) -> Spoil:
     return spoil
 
 
-def replace_by(name: str | Callable[[Path], str], make: Make) -> Spoil:
+def replaced(name: str | Callable[[Path], str], make: Make) -> Spoil:
     """Replace a file or folder by what `make` creates."""
 
     def spoil(root: Path) -> None:
@@ -92,7 +92,7 @@ def file_with(text: str | bytes) -> Make:
     return lambda path, root: path.write_bytes(text if isinstance(text, bytes) else text.encode())
 
 
-def nested_json(levels: int) -> Make:
+def deep(levels: int) -> Make:
     """Create a file of nested JSON objects."""
     return file_with('{"a":' * levels + "1" + "}" * levels)
 
@@ -120,7 +120,7 @@ def change_lines(change: Callable[[list[dict[str, Any]]], list | None], name: st
     return spoil
 
 
-def change_entry(name: str = HISTORIES, /, **changes: Any) -> Spoil:
+def entry(name: str = HISTORIES, /, **changes: Any) -> Spoil:
     """Change fields of the first line of the index."""
     return change_lines(lambda values: values[0].update(changes), name)
 
@@ -130,7 +130,7 @@ def change_info(**changes: Any) -> Spoil:
     return change_json(INFO, lambda value: value.update(changes))
 
 
-def change_theta(**changes: Any) -> Spoil:
+def theta(**changes: Any) -> Spoil:
     """Change theta of the learned teammate, and update the id of the teammate's task."""
 
     def spoil(root: Path) -> None:
@@ -147,7 +147,7 @@ def change_theta(**changes: Any) -> Spoil:
     return spoil
 
 
-def change_table(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
+def table(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
     """Change the chunk table of the shard in place, or replace it by the result of `change`."""
 
     def spoil(root: Path) -> None:
@@ -164,7 +164,7 @@ def npy_header(header: str, version: bytes = b"\x01\x00", length: int | None = N
     return file_with(b"\x93NUMPY" + version + size.to_bytes(2 if version[0] == 1 else 4, "little") + header.encode())
 
 
-def edit_hdf5(change: ChangeFile, name: str = SHARD) -> Spoil:
+def hdf5(change: ChangeFile, name: str = SHARD) -> Spoil:
     """Change an HDF5 file, but not its chunk table."""
 
     def spoil(root: Path) -> None:
@@ -194,7 +194,7 @@ def typed_actions(dtype: Any) -> ChangeFile:
     return new_dataset(dtype=dtype, chunks=(1, 120), compression="gzip")
 
 
-def action_link(target: Callable[[Path], Any]) -> ChangeFile:
+def link(target: Callable[[Path], Any]) -> ChangeFile:
     """Replace the actions by a link."""
     return set_actions(lambda group, out: group.__setitem__("actions", target(out)))
 
@@ -218,7 +218,7 @@ class Case(NamedTuple):
 CASES: dict[str, Case] = {}
 
 
-def add_cases(kind: str, message: str, spoils: Mapping[str, Spoil]) -> None:
+def add(kind: str, message: str, spoils: Mapping[str, Spoil]) -> None:
     """Add cases of one kind with the same message."""
     for name, spoil in spoils.items():
         add_case(f"{kind}: {name}", Case(kind, message, spoil))
@@ -230,7 +230,7 @@ def add_hashed(message: str, spoils: Mapping[str, Spoil]) -> None:
     def with_manifest(spoil: Spoil) -> Spoil:
         return lambda root: (spoil(root), write_manifest(root))
 
-    add_cases("release", message, {name: with_manifest(spoil) for name, spoil in spoils.items()})
+    add("release", message, {name: with_manifest(spoil) for name, spoil in spoils.items()})
 
 
 def add_case(name: str, case: Case) -> None:
@@ -248,20 +248,20 @@ _NAMES = {
     "control": "meta/\x1b[2J",
     "long": "x" * 300,
 }
-add_cases("release", "leads out of the release", {f"manifest: {name}": add_line(path) for name, path in _NAMES.items()})
-add_cases(
+add("release", "leads out of the release", {f"manifest: {name}": add_line(path) for name, path in _NAMES.items()})
+add(
     "release", "are one file on some systems", {"manifest: upper case": add_line(SHARD.replace("teammate", "TEAMMATE"))}
 )
-add_cases("release", "not a file that a release has", {"manifest: code": add_line("sitecustomize.py")})
+add("release", "not a file that a release has", {"manifest: code": add_line("sitecustomize.py")})
 _many = "".join(f"data/d/d/{number}.h5\n{number:064}  " for number in range(50_000)) + "data/d/d/last.h5"
-add_cases("release", "listed in the manifest, but missing", {"manifest: many lines": add_line(_many)})
+add("release", "listed in the manifest, but missing", {"manifest: many lines": add_line(_many)})
 
 for _file in (INFO, SHARD, policy_path):
     _label = _file if isinstance(_file, str) else "teammate"
-    add_cases("release", "leads out of the release", {f"link out: {_label}": replace_by(_file, secret_link)})
-    add_cases("release", "neither a file nor a folder", {f"pipe: {_label}": replace_by(_file, named_pipe)})
+    add("release", "leads out of the release", {f"link out: {_label}": replaced(_file, secret_link)})
+    add("release", "neither a file nor a folder", {f"pipe: {_label}": replaced(_file, named_pipe)})
     _too_large = r"expected at most|more than|truncated|twice|chunk table"
-    add_cases("release", _too_large, {f"a terabyte: {_label}": replace_by(_file, terabyte)})
+    add("release", _too_large, {f"a terabyte: {_label}": replaced(_file, terabyte)})
 
 
 def deep_folder(root: Path) -> None:
@@ -277,44 +277,38 @@ def deep_folder(root: Path) -> None:
 
 
 _folders = ("data", "meta")
-add_cases(
+add(
     "release",
     "leads out of the release",
-    {f"folder linked out: {name}": replace_by(name, folder_link) for name in _folders},
+    {f"folder linked out: {name}": replaced(name, folder_link) for name in _folders},
 )
-add_cases("release", "extra: not listed", {"unlisted pipe": replace_by("extra", named_pipe)})
-add_cases("release", "not listed in the manifest", {"folders too deep": deep_folder})
+add("release", "extra: not listed", {"unlisted pipe": replaced("extra", named_pipe)})
+add("release", "not listed in the manifest", {"folders too deep": deep_folder})
 
 
 def _terminal_codes(root: Path) -> None:
     Path(os.fsdecode(os.fsencode(root) + b"/\x1b]0;owned\x07\xff")).touch()
 
 
-add_cases("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes": _terminal_codes})
+add("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes": _terminal_codes})
 
-add_hashed("matching regex", {"checkpoint's hash": change_theta(sha256="../../outside")})
+add_hashed("matching regex", {"checkpoint's hash": theta(sha256="../../outside")})
 _paths = {"above": "../../outside", "absolute": "/etc", "backslash": "..\\..\\outside", "surrogate": "\ud800"}
 add_hashed(
-    "expected a path within",
-    {f"checkpoint's path: {name}": change_theta(checkpoint=path) for name, path in _paths.items()},
+    "expected a path within", {f"checkpoint's path: {name}": theta(checkpoint=path) for name, path in _paths.items()}
 )
 
 # Cases of extreme numbers, sizes and texts
 
 _integers = {"T": 2**62, "seed": 10**4000}
-add_hashed(
-    "Expected `int` <=", {f"index: large {name}": change_entry(**{name: value}) for name, value in _integers.items()}
-)
-add_hashed("the index implies", {"rows: 2**39": change_entry(T=2**39)})
+add_hashed("Expected `int` <=", {f"index: large {name}": entry(**{name: value}) for name, value in _integers.items()})
+add_hashed("the index implies", {"rows: 2**39": entry(T=2**39)})
 add_hashed("histories", {"info: histories 2**62": change_info(histories=2**62)})
 _size = change_json(INFO, lambda value: value["shards"].update({SHARD: 2**61}))
 add_hashed(r"expected 2,305,843,009,213,693,952 bytes, found \d", {"info: shard of 2**61 bytes": _size})
 add_hashed("shards: expected", {"info: no shards": change_info(shards={})})
 _digits = file_with('{"format_version": ' + "9" * 10**6 + "}")
-add_hashed(
-    "malformed",
-    {"info: too deep": replace_by(INFO, nested_json(100_000)), "info: many digits": replace_by(INFO, _digits)},
-)
+add_hashed("malformed", {"info: too deep": replaced(INFO, deep(100_000)), "info: many digits": replaced(INFO, _digits)})
 add_hashed("SemVer", {"info: version with terminal codes": change_info(data_version="\x1b[2J")})
 
 
@@ -327,14 +321,14 @@ def nested_lists(levels: int) -> list:
 
 
 _deep_theta = change_lines(lambda values: values[0]["teammate"]["theta"].update(x=nested_lists(400)), TASKS)
-_deep_files = {f"deep: {name}": replace_by(name, nested_json(500)) for name in (INFO, PROVENANCE)}
+_deep_files = {f"deep: {name}": replaced(name, deep(500)) for name in (INFO, PROVENANCE)}
 add_hashed("levels deep", _deep_files | {"tasks: deep theta": _deep_theta})
 _endless_line = file_with(b"a" * 2**24)
 for _of, _file in {"index": HISTORIES, "tasks": TASKS}.items():
-    add_hashed("expected at most", {f"{_of}: one endless line": replace_by(_file, _endless_line)})
-add_hashed("line 1: ", {"index: a surrogate": change_entry(task_id="\ud800")})
-add_hashed("line 1: JSON is malformed", {"index: not a number": change_entry(score=float("nan"))})
-add_hashed("Expected `float` <", {"index: infinite": change_entry(return_end=1e308)})
+    add_hashed("expected at most", {f"{_of}: one endless line": replaced(_file, _endless_line)})
+add_hashed("line 1: ", {"index: a surrogate": entry(task_id="\ud800")})
+add_hashed("line 1: JSON is malformed", {"index: not a number": entry(score=float("nan"))})
+add_hashed("Expected `float` <", {"index: infinite": entry(return_end=1e308)})
 
 # Cases of damaged chunk tables and chunks
 
@@ -386,26 +380,22 @@ _TABLES = {
     "pickle": pickled_table,
     "archive": archived_table,
 }
-add_hashed(
-    "chunk table|expected rows of", {f"table: {name}": replace_by(TABLE, make) for name, make in _TABLES.items()}
-)
-add_hashed(
-    "covers more than", {"table: huge chunks": change_table(lambda rows: rows["size"].__setitem__(0, 2**32 - 1))}
-)
-add_hashed("cover|crc32", {"table: one offset": change_table(lambda rows: rows["offset"].__setitem__(slice(None), 0))})
-add_hashed("cannot be", {"table: no bytes": change_table(lambda rows: rows["size"].__setitem__(0, 0))})
+add_hashed("chunk table|expected rows of", {f"table: {name}": replaced(TABLE, make) for name, make in _TABLES.items()})
+add_hashed("covers more than", {"table: huge chunks": table(lambda rows: rows["size"].__setitem__(0, 2**32 - 1))})
+add_hashed("cover|crc32", {"table: one offset": table(lambda rows: rows["offset"].__setitem__(slice(None), 0))})
+add_hashed("cannot be", {"table: no bytes": table(lambda rows: rows["size"].__setitem__(0, 0))})
 add_hashed("cannot be|twice", {"chunk that inflates to a gigabyte": inflating_chunk})
 
 # Cases of HDF5 structures that libhdf5 would follow, load or trust
 
 
-def virtual_data(group: Any, out: Path) -> None:
+def virtual(group: Any, out: Path) -> None:
     layout = h5py.VirtualLayout((4, 120), "i1")
     layout[0] = h5py.VirtualSource(str(out / "secret.h5"), "secret", (120,))
     group.create_virtual_dataset("actions", layout)
 
 
-def external_data(group: Any, out: Path) -> None:
+def external(group: Any, out: Path) -> None:
     group.create_dataset("actions", (480,), "i1", external=[(str(out / "secret.txt"), 0, 480)])
 
 
@@ -430,14 +420,11 @@ def link_group_out(file: Any, out: Path) -> None:
 
 _SHARED: dict[str, dict[str, ChangeFile]] = {
     "lead out of the file": {
-        "soft link": action_link(lambda out: h5py.SoftLink("/0/state")),
-        "link to a file": action_link(lambda out: h5py.ExternalLink(str(out / "secret.h5"), "/secret")),
-        "link to a pipe": action_link(lambda out: h5py.ExternalLink(str(out / "pipe"), "/secret")),
+        "soft link": link(lambda out: h5py.SoftLink("/0/state")),
+        "link to a file": link(lambda out: h5py.ExternalLink(str(out / "secret.h5"), "/secret")),
+        "link to a pipe": link(lambda out: h5py.ExternalLink(str(out / "pipe"), "/secret")),
     },
-    "in other files|a local heap": {
-        "external storage": set_actions(external_data),
-        "virtual": set_actions(virtual_data),
-    },
+    "in other files|a local heap": {"external storage": set_actions(external), "virtual": set_actions(virtual)},
     r"filters \[32004\]|found \(\[32004\]": {"a plugin's filter": set_actions(filtered_data)},
     "expected numbers": {
         "texts": typed_actions(h5py.string_dtype()),
@@ -457,14 +444,14 @@ _OF_SHARDS: dict[str, dict[str, ChangeFile]] = {
     },
 }
 for _message, _changes in (_SHARED | _OF_SHARDS).items():
-    add_hashed(_message, {f"shard: {name}": edit_hdf5(change) for name, change in _changes.items()})
+    add_hashed(_message, {f"shard: {name}": hdf5(change) for name, change in _changes.items()})
 
 # Cases of published files
 
 
 def endless_history(root: Path) -> None:
     """Give all datasets of the first published history 2**39 rows, as its index line then states."""
-    change_entry("histories_index.jsonl", T=2**39)(root)
+    entry("histories_index.jsonl", T=2**39)(root)
     with h5py.File(root / "histories.h5", "r+") as file:
         group: Any = file["0"]
         for name, old in list(group.items()):
@@ -483,34 +470,26 @@ def inflating_published_chunks(file: Any, out: Path) -> None:
 
 _H5, _INDEX = "histories.h5", "histories_index.jsonl"
 for _message, _changes in _SHARED.items():
-    _spoils = {name: edit_hdf5(change, _H5) for name, change in _changes.items()}
-    add_cases("published", f"group /0.*({_message})|cannot be read: .*{_message}", _spoils)
+    _spoils = {name: hdf5(change, _H5) for name, change in _changes.items()}
+    add("published", f"group /0.*({_message})|cannot be read: .*{_message}", _spoils)
 _PUBLISHED = (_H5, _INDEX)
 for _message, _make in {"leads out": secret_link, "neither a file": named_pipe, "at most|HDF5": terabyte}.items():
-    add_cases("published", _message, {f"{_make.__name__}: {name}": replace_by(name, _make) for name in _PUBLISHED})
-_endless = edit_hdf5(new_dataset((2**39,), "i4", chunks=(4096,), compression="gzip"), _H5)
-add_cases("published", "expected numbers of shape", {"endless rows": _endless})
-add_cases("published", "cannot hold them|memory", {"endless history": endless_history})
-add_cases(
-    "published",
-    "not stored as|inflate",
-    {"chunk that inflates to a gigabyte": edit_hdf5(inflating_published_chunks, _H5)},
-)
-add_cases("published", "Expected `int` >= 1", {"rows below zero": change_entry(_INDEX, T=-5)})
-add_cases("published", "missing", {"group above": change_entry(_INDEX, h5_group="../0")})
-add_cases(
-    "published", "lite", {"circle of groups": edit_hdf5(lambda file, out: file["0"].__setitem__("a", file["0"]), _H5)}
-)
-add_cases("published", "printable", {"task id of surrogates": change_entry(_INDEX, task_id="\ud800")})
-add_cases("published", "expected at most", {"one endless line": replace_by(_INDEX, _endless_line)})
+    add("published", _message, {f"{_make.__name__}: {name}": replaced(name, _make) for name in _PUBLISHED})
+_endless = hdf5(new_dataset((2**39,), "i4", chunks=(4096,), compression="gzip"), _H5)
+add("published", "expected numbers of shape", {"endless rows": _endless})
+add("published", "cannot hold them|memory", {"endless history": endless_history})
+add("published", "not stored as|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published_chunks, _H5)})
+add("published", "Expected `int` >= 1", {"rows below zero": entry(_INDEX, T=-5)})
+add("published", "missing", {"group above": entry(_INDEX, h5_group="../0")})
+add("published", "lite", {"circle of groups": hdf5(lambda file, out: file["0"].__setitem__("a", file["0"]), _H5)})
+add("published", "printable", {"task id of surrogates": entry(_INDEX, task_id="\ud800")})
+add("published", "expected at most", {"one endless line": replaced(_INDEX, _endless_line)})
 
 # Cases of faulty servers
 
-add_cases(
-    "served", "expected at most", {f"a terabyte: {name}": replace_by(name, terabyte) for name in (MANIFEST, TABLE)}
-)
-add_cases("served", "expected at most|sha256", {"a terabyte: shard": replace_by(SHARD, terabyte)})
-add_cases("served", "leads out of the release", {"names above": add_line("../../new")})
+add("served", "expected at most", {f"a terabyte: {name}": replaced(name, terabyte) for name in (MANIFEST, TABLE)})
+add("served", "expected at most|sha256", {"a terabyte: shard": replaced(SHARD, terabyte)})
+add("served", "leads out of the release", {"names above": add_line("../../new")})
 for _name, _message, _rules in (
     ("endless manifest", "MANIFEST", {"*/MANIFEST.sha256": Long(TERABYTE)}),
     ("endless index", "expected at most|more came|says", {f"*/{HISTORIES}": Long(TERABYTE)}),
