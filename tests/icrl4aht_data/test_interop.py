@@ -26,7 +26,7 @@ def sampler(lite):
 class TestLoaderPasses:
     """Regression: each pass over a loader repeated the batches of the first pass."""
 
-    def test_each_pass_over_a_torch_loader_continues(self, sampler):
+    def test_each_pass_over_a_torch_loader_returns_new_batches(self, sampler):
         loader, n = torch_loader(sampler), len(sampler)
         for number in range(3):
             assert len(loader) == n

@@ -80,7 +80,7 @@ def bundled_tasks(split: str, kind: Literal["", "diverse"] = "") -> list[Task]:
     return [task for track in TRACKS for task in read_tasks(manifest_path(track, split, kind))]
 
 
-def plan_of_the_paper() -> tuple[float, ...]:
+def paper_plan_sizes() -> tuple[float, ...]:
     """Return learners, environment steps, recorded and kept transitions of the profile `paper`."""
     profile = load_profile("paper")
     ego, count = profile.ego, sum(profile.tasks_on(name, "ppo") for name in profile.layouts)
@@ -109,7 +109,7 @@ def tiny_model_size() -> tuple[int, int, int]:
 
 
 def count_test_behaviours() -> tuple[int, ...]:
-    """Return the numbers of behaviours and of test tasks, then behaviours of the cells that docs/protocol.md names."""
+    """Return counts of test behaviours and test tasks, then behaviour counts of cells named in docs/protocol.md."""
     by_id = {task.task_id: task for task in bundled_tasks("test")}
     counts = Counter((task.layout.name, task.teammate_family) for task in by_id.values())
     for first, *others in alike_tasks():
@@ -186,7 +186,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     (
         "docs/scale",
         "tasks {} learners 640 environment steps {} recorded transitions {} kept transitions {}",
-        plan_of_the_paper,
+        paper_plan_sizes,
     ),
     ("docs/choices", "{} behaviours on {} layouts have one so far", count_best_responses),
     ("docs/choices", "plays on {} rearranged versions", lambda: reference.TRACK_PLAY["layout"]["rearranged"]),

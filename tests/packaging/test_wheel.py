@@ -234,7 +234,7 @@ def install_hint(*extras: str) -> str:
 
 
 def run_hint(hint: str, commands: Path) -> None:
-    """Run the install command at the end of a message in an environment."""
+    """In an environment, run the install command at the end of a message."""
     found = re.search(r"pip install (.*)$", hint)
     assert found, hint
     install_packages(commands / "python", *shlex.split(found[1]))

@@ -260,7 +260,7 @@ def test_verify_finds_a_group_in_place_of_a_dataset(damaged):
 
 
 def update_metadata_rows(root):
-    """Recompute the chunk table's rows for the bytes between chunks, then the manifest."""
+    """Recompute the chunk table's rows for the bytes between chunks, then rewrite the manifest."""
     path = root / chunk_table_name(SHARD)
     table = np.load(path)
     chunks = table[table["rows"] > 0]
@@ -269,7 +269,7 @@ def update_metadata_rows(root):
 
 
 @pytest.mark.parametrize("heap", ["local", "global"])
-def test_verify_ends_on_a_shard_with_a_cyclic_heap(damaged, heap):
+def test_verify_terminates_on_a_shard_with_a_cyclic_heap(damaged, heap):
     """Regression: libhdf5 never returns from a free list or heap object that points to itself."""
     path = damaged / SHARD
     if heap == "local":

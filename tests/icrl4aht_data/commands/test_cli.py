@@ -176,7 +176,7 @@ def test_commands_run_without_stdout(lite, monkeypatch, arguments, code):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("program", ["icrl4aht_data list", "icrl4aht_data show --json", "icrl4aht_data --help"])
-def test_a_closed_pipe_ends_a_command_quietly(program):
+def test_command_exits_silently_if_its_output_pipe_is_closed(program):
     reader, writer = os.pipe()
     os.close(reader)
     arguments = [sys.executable, "-m", *program.split()]

@@ -97,7 +97,7 @@ class TestReleaseWithLayouts:
         assert verify_release(root, level="deep").ok
 
     def test_commands_accept_names_of_release_layouts(self, root):
-        """Names of a release's layouts are known once it is read; names of the package's layouts are always known."""
+        """Layout names of a release are known once the release is read; names of package layouts are always known."""
         printed = run_cli("list", root, "--layout", "mine-3-5")
         assert "mine-3-5" in printed and "coord_simple" not in printed
         with pytest.raises(UnknownNameError, match="unknown layout 'nowhere'"):

@@ -186,7 +186,9 @@ def test_a_killed_upload_resumes(hub, published_release):
         ("*/tag/*", "POST", 500, r"files sent so far are kept"),
     ],
 )
-def test_server_errors_are_wrapped_and_the_same_command_resumes(hub, published_release, path, method, status, message):
+def test_server_errors_are_reported_and_repeating_the_upload_succeeds(
+    hub, published_release, path, method, status, message
+):
     hub.faults.next(Status(status), times=9, path=path, method=method)
     with pytest.raises(UploadError, match=rf"^us/histories at http://127\.0\.0\.1:\d+: .*{status}.*; .*{message}"):
         upload_release(published_release, ADDRESS)

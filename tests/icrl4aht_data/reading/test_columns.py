@@ -99,7 +99,7 @@ def test_label_view_filter_selects_histories(expert_release, lite):
 
 
 def test_releases_with_old_source_names_are_read_and_filtered(tmp_path):
-    """Older releases have the source `student`, which was renamed since."""
+    """Older releases have the source `student`, a name that new releases no longer use."""
     random_release(tmp_path / "release", streams=1, sources=["student", "noise", "agent", "search"])
     assert load_icrl4aht(tmp_path / "release", source="student").ids.tolist() == [0]
 

@@ -125,7 +125,7 @@ def test_history_fields_are_cached_read_only_arrays(lite):
 
 
 @pytest.mark.parametrize("obs", ["float32", "uint8", "state"])
-def test_observations_follow_the_obs_option(lite_or_full, obs):
+def test_obs_option_sets_the_type_of_observations(lite_or_full, obs):
     root, written = lite_or_full
     history = load_icrl4aht(root, layout="demo_wide", obs=obs)[0]
     state = written[history.entry.history_id]["state"]

@@ -267,7 +267,8 @@ class TestBatches:
         assert set(sampler._draw(0)[1].ravel().tolist()) == set(range(120))
 
     def test_invalid_contexts_raise_errors(self, converted_release, tmp_path):
-        dataset = load_icrl4aht(converted_release, task_id="task_a", obs="uint8")  # 114 and 123 transitions
+        # the histories have 114 and 123 transitions
+        dataset = load_icrl4aht(converted_release, task_id="task_a", obs="uint8")
         assert dataset.dpt(batch_size=2, context=114)[0].context_obs.shape == (2, 114, 5, 5, 45)
         with pytest.raises(OptionError, match="context = 115: the shortest history has 114 transitions"):
             dataset.dpt(batch_size=2, context=115)

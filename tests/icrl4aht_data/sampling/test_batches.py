@@ -41,7 +41,7 @@ def test_prefetched_batches_keep_their_order(sampler, prefetch, reuse):
 
 
 @pytest.mark.parametrize("prefetch", [0, 2])
-def test_a_second_loop_continues_after_the_first(sampler, prefetch):
+def test_second_loop_over_batches_continues_after_the_first(sampler, prefetch):
     batches = sampler.batches(2, 5, prefetch=prefetch)
     for numbers in ([2, 3, 4], [5, 6, 7]):
         assert [batches.next - 1 for _ in batches] == numbers

@@ -121,7 +121,7 @@ class TestMissingLabels:
 
 
 def test_weak_oracle_labels_cause_a_warning(two_sources, monkeypatch):
-    """The oracle earns 5 in all tasks, and the histories seem to end with returns of 11."""
+    """The oracle earns 5 in all tasks, less than half of the patched final returns of 11."""
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", source="ppo")
     column = type(dataset).column
 

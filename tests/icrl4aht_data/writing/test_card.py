@@ -58,7 +58,7 @@ def make_provenance(
 
 
 def four_tasks() -> Tasks:
-    """Return PPO and noise tasks with one teammate, a task with a validation teammate, and one on coord_simple."""
+    """Return PPO and noise tasks with one teammate, a task with a validation teammate, and a task on coord_simple."""
     return [
         (heuristic_task("demo_wide", "H3", 12), make_provenance("ppo"), [(0, 0.0, 20.0), (1, 0.0, 4.0)]),
         (heuristic_task("demo_wide", "H3", 12, seed=1), make_provenance("noise"), [(0, 1.0, 41.0), (0, 0.0, 45.0)]),
@@ -139,7 +139,7 @@ def test_card_names_teammates_that_behave_like_test_teammates(write_meta):
 def test_bundled_card_is_short_and_up_to_date():
     content = facts(MINI)
     assert (MINI / "README.md").read_text() == render_card(content)
-    # Lines that separate tables are no words.
+    # The separator lines of tables do not count as words.
     words = [word for word in (MINI / "README.md").read_text().split() if word.strip("|:-")]
     assert len(words) <= 2500
 

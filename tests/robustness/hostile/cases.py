@@ -286,11 +286,11 @@ add("release", "extra: not listed", {"unlisted pipe": replaced("extra", named_pi
 add("release", "not listed in the manifest", {"folders too deep": deep_folder})
 
 
-def _terminal_codes(root: Path) -> None:
+def _add_name_with_terminal_codes(root: Path) -> None:
     Path(os.fsdecode(os.fsencode(root) + b"/\x1b]0;owned\x07\xff")).touch()
 
 
-add("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes": _terminal_codes})
+add("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes": _add_name_with_terminal_codes})
 
 add_hashed("matching regex", {"checkpoint's hash": theta(sha256="../../outside")})
 _paths = {"above": "../../outside", "absolute": "/etc", "backslash": "..\\..\\outside", "surrogate": "\ud800"}
