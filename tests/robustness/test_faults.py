@@ -77,7 +77,7 @@ def cache_folder(tmp_path, monkeypatch) -> Path:
 
 
 class DamagedCopy:
-    """Small release for damages, with the data that reading returned before any damage."""
+    """Small release that tests damage, with the data that reading returned before any damage."""
 
     def __init__(self, root: Path) -> None:
         random_release(root, teammates=2, streams=1, episodes=6, length=15)
