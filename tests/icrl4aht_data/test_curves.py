@@ -1,4 +1,4 @@
-"""The figure of returns by episode."""
+"""Test the figure of returns by episode."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves
 
 
-def test_a_source_has_a_panel_with_means_of_layouts_and_of_all_histories():
+def test_panel_of_a_source_shows_means_by_layout_and_split():
     curves = SourceCurves()
     add_curve(curves, "search", "demo_wide", "train", np.array([0.0, 20, 40, 40]))
     add_curve(curves, "search", "coord_ring", "train", np.array([0.0, 0, 0]))
@@ -20,11 +20,12 @@ def test_a_source_has_a_panel_with_means_of_layouts_and_of_all_histories():
     assert noise.get_ylim() == search.get_ylim()
     drawn = {line.get_label(): np.asarray(line.get_xydata()) for line in search.lines}
     np.testing.assert_allclose(drawn["demo_wide"], [[1, 0], [2, 20], [3, 40], [4, 40]])
-    np.testing.assert_allclose(drawn["all of split train"], [[1, 0], [2, 10], [3, 20]])  # as far as both histories go
+    # The mean over histories ends with the shortest history.
+    np.testing.assert_allclose(drawn["all of split train"], [[1, 0], [2, 10], [3, 20]])
     np.testing.assert_allclose(drawn["all of split validation"], [[1, -20], [2, 20]])
     first = np.asarray(noise.lines[0].get_xydata())
     assert len(first) <= 25
     np.testing.assert_allclose(first[0], [1, 0])
-    # A block's mean is that of its episodes, and all episodes are in one block.
+    # Each drawn point is the mean of a block of episodes, and the blocks cover all episodes.
     assert first[-1, 1] > 800
     assert np.all(np.diff(first[:, 1]) > 0)

@@ -1,5 +1,4 @@
-"""Releases at an address: opening, reading, downloading, faults of servers; over HTTP, S3 and the Hub's protocol, all
-served on loopback to the real clients."""
+"""Test remote releases over HTTP, S3 and the Hub: opening, reading, downloading and faults of servers."""
 
 from __future__ import annotations
 
@@ -54,8 +53,8 @@ ALWAYS = 10**9
 
 
 @pytest.fixture(autouse=True)
-def data(tmp_path, monkeypatch) -> Path:
-    """Return an empty data folder; shorten the waits before retries."""
+def data_folder(tmp_path, monkeypatch) -> Path:
+    """Set an empty data folder, shorten the waits before retries, and return the folder."""
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     monkeypatch.delenv("ICRL4AHT_REMOTE", raising=False)
     monkeypatch.setattr(clients, "_WAITS", (0.01, 0.01, 0.01))
@@ -66,8 +65,8 @@ def data(tmp_path, monkeypatch) -> Path:
 
 
 @contextmanager
-def served(kind: str, folder: Path) -> Iterator[tuple[str, Server | Hub | None]]:
-    """Serve a release; yield its address, and the server if it can inject faults."""
+def serve_release(kind: str, folder: Path) -> Iterator[tuple[str, Server | Hub | None]]:
+    """Serve a release; yield its address, and the server if the server can inject faults."""
     if kind == "http":
         with http_server(folder) as server:
             yield server.url, server
@@ -83,7 +82,7 @@ def served(kind: str, folder: Path) -> Iterator[tuple[str, Server | Hub | None]]
 KINDS = pytest.mark.parametrize("kind", ["http", "hub", pytest.param("s3", marks=pytest.mark.slow)])
 
 
-def batch(root, layout="demo_wide", **options):
+def load_batch(root, layout="demo_wide", **options):
     return load_icrl4aht(root, layout=layout, **options).ad(batch_size=8, length=30)[0]
 
 
@@ -91,10 +90,10 @@ def shards_in(folder: Path) -> set[str]:
     return {path.name for path in (folder / "data").rglob("*.h5")}
 
 
-# Reading
+# Tests of reading
 
 
-def test_a_source_card_of_an_earlier_version_is_not_needed(lite, tmp_path):
+def test_remote_release_with_an_old_source_card_can_be_opened(lite, tmp_path):
     shutil.copytree(lite[0], tmp_path / "served")
     (tmp_path / "served" / "meta" / "source_card.md").write_text("# card\n")
     write_manifest(tmp_path / "served")
@@ -105,7 +104,7 @@ def test_a_source_card_of_an_earlier_version_is_not_needed(lite, tmp_path):
 @KINDS
 def test_a_remote_release_equals_its_local_copy(kind, lite, monkeypatch):
     local = load_icrl4aht(lite[0])
-    with served(kind, lite[0]) as (url, _):
+    with serve_release(kind, lite[0]) as (url, _):
         remote = load_icrl4aht(url)
         assert [h.entry for h in remote] == [h.entry for h in local]
         assert remote.info == local.info and remote.recover_teammate(3) == local.recover_teammate(3)
@@ -113,30 +112,30 @@ def test_a_remote_release_equals_its_local_copy(kind, lite, monkeypatch):
         one = remote.filter(layout="demo_wide")
         assert np.array_equal(one[0].expert_actions, local.filter(layout="demo_wide")[0].expert_actions)
         assert len(shards_in(remote.root)) == 1, "a shard is fetched when one of its histories is read"
-        assert_equal(batch(pickle.loads(pickle.dumps(one)).origin.folder), batch(lite[0]))
+        assert_equal(load_batch(pickle.loads(pickle.dumps(one)).origin.folder), load_batch(lite[0]))
         for cache in ("auto", "ram", "mmap", "stream"):
-            assert_equal(batch(url, "coord_simple", cache=cache), batch(lite[0], "coord_simple"))
+            assert_equal(load_batch(url, "coord_simple", cache=cache), load_batch(lite[0], "coord_simple"))
         monkeypatch.setenv("ICRL4AHT_OFFLINE", "1")
-        assert_equal(batch(url), batch(lite[0]))
+        assert_equal(load_batch(url), load_batch(lite[0]))
     assert not [path for path in remote.root.parent.rglob("*") if "partial" in path.name or path.suffix == ".lock"]
 
 
 @KINDS
 @pytest.mark.parametrize("variable", ["HF_HUB_OFFLINE", "ICRL4AHT_OFFLINE"])
-def test_offline(kind, lite, variable, monkeypatch):
-    with served(kind, lite[0]) as (url, _):
+def test_offline_mode_reads_only_downloaded_files(kind, lite, variable, monkeypatch):
+    with serve_release(kind, lite[0]) as (url, _):
         monkeypatch.setenv(variable, "1")
         with pytest.raises(OfflineError, match="offline, and this release is not downloaded"):
             load_icrl4aht(url)
         monkeypatch.delenv(variable)
         fetch_planned(plan_download(url, layout="demo_wide"))
         monkeypatch.setenv(variable, "1")
-        assert_equal(batch(url), batch(lite[0]))
+        assert_equal(load_batch(url), load_batch(lite[0]))
         with pytest.raises(OfflineError, match=r"offline, but these files are missing.*: .*data/teammate/coord_simple/train-0"):
-            batch(url, "coord_simple", cache="ram")
+            load_batch(url, "coord_simple", cache="ram")
 
 
-def test_a_new_version_at_the_same_address(lite, full, tmp_path):
+def test_new_version_at_an_address_is_opened_as_another_release(lite, full, tmp_path):
     shutil.copytree(lite[0], tmp_path / "served")
     with http_server(tmp_path / "served") as server:
         first = load_icrl4aht(server.url)
@@ -148,7 +147,7 @@ def test_a_new_version_at_the_same_address(lite, full, tmp_path):
             _ = first[0].actions
 
 
-def test_the_revision_is_pinned_and_shown(lite, full, tmp_path):
+def test_hub_revision_is_pinned_and_shown(lite, full, tmp_path):
     with hub_server(tmp_path / "hub") as hub:
         first = hub.add_repo("org/name", lite[0], tag="v0.0.1")
         hub.add_repo("org/name", full[0])
@@ -159,13 +158,13 @@ def test_the_revision_is_pinned_and_shown(lite, full, tmp_path):
         assert (shown["revision"], shown["data_version"]) == (first, tagged.info.data_version)
 
 
-# Downloading
+# Tests of downloading
 
 
 @KINDS
-def test_a_download_of_a_part_and_then_of_the_rest(kind, lite, tmp_path):
+def test_partial_download_can_be_completed_later(kind, lite, tmp_path):
     target = tmp_path / "mine"
-    with served(kind, lite[0]) as (url, _):
+    with serve_release(kind, lite[0]) as (url, _):
         plan = plan_download(url, to=target, layout="demo_wide")
         assert sum(name.endswith(".h5") for name in plan.files) == 1
         advanced: list[int] = []
@@ -185,7 +184,7 @@ def test_a_download_of_a_part_and_then_of_the_rest(kind, lite, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} <= {"mine", "data", "hub"}, "no locks"
 
 
-def test_the_command(lite, tmp_path, monkeypatch):
+def test_download_command_fetches_missing_and_changed_files(lite, tmp_path, monkeypatch):
     target = tmp_path / "mine"
     with http_server(lite[0]) as server:
         plan = json.loads(run_cli("download", server.url, "--layout", "demo_wide", "--dry-run", "--json"))
@@ -204,7 +203,7 @@ def test_the_command(lite, tmp_path, monkeypatch):
     assert contents(target) == contents(lite[0])
 
 
-def test_folders_with_other_content_are_refused(lite, full, tmp_path):
+def test_download_refuses_folders_with_other_content(lite, full, tmp_path):
     target = tmp_path / "home"
     target.mkdir()
     (target / ".bashrc").write_text("mine")
@@ -229,9 +228,9 @@ fetch_planned(plan_download(sys.argv[1], to=Path(sys.argv[2]) if len(sys.argv) >
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "to"), [("http", "mine"), ("hub", None)])
-def test_a_killed_download_is_resumed_by_file(kind, to, lite, tmp_path):
+def test_killed_download_resumes_with_the_missing_files(kind, to, lite, tmp_path):
     arguments = [str(tmp_path / to)] if to else []
-    with served(kind, lite[0]) as (url, server):
+    with serve_release(kind, lite[0]) as (url, server):
         assert server is not None
         server.faults.next(Slow(bytes_per_second=2000), times=ALWAYS, path="*.h5")
         environment = os.environ | (server.environment if isinstance(server, Hub) else {})
@@ -251,7 +250,7 @@ def test_a_killed_download_is_resumed_by_file(kind, to, lite, tmp_path):
         assert not to or contents(folder) == contents(lite[0])
 
 
-# Faults
+# Tests of server faults
 
 
 WRONG: dict[str, tuple[Fault, str]] = {
@@ -270,15 +269,15 @@ WRONG: dict[str, tuple[Fault, str]] = {
 
 @pytest.mark.parametrize("fault", WRONG)
 @pytest.mark.parametrize("kind", ["http", "hub"])
-def test_permanent_server_errors(kind, fault, lite, tmp_path):
+def test_permanent_server_errors_are_raised_with_the_file_name(kind, fault, lite, tmp_path):
     wrong, message = WRONG[fault]
-    with served(kind, lite[0]) as (url, server):
+    with serve_release(kind, lite[0]) as (url, server):
         assert server is not None
         server.faults.next(wrong, times=ALWAYS, path="*.h5")
         began = time.monotonic()
         for use in (
             lambda: fetch_planned(plan_download(url, to=tmp_path / "mine")),
-            lambda: batch(url, cache="stream"),
+            lambda: load_batch(url, cache="stream"),
         ):
             with pytest.raises(RemoteError, match=message) as caught:
                 use()
@@ -290,7 +289,7 @@ def test_permanent_server_errors(kind, fault, lite, tmp_path):
         seen = len(server.log)
         fetch_planned(plan_download(url, to=tmp_path / "mine"))
         assert not [request for request in server.log[seen:] if request.path.endswith("README.md")] or kind == "hub"
-        assert_equal(batch(url), batch(lite[0]))
+        assert_equal(load_batch(url), load_batch(lite[0]))
     assert contents(tmp_path / "mine") == contents(lite[0])
 
 
@@ -299,7 +298,7 @@ def test_permanent_server_errors(kind, fault, lite, tmp_path):
 )
 @pytest.mark.parametrize("kind", ["http", "hub"])
 def test_transient_errors_are_retried(kind, fault, lite, tmp_path):
-    with served(kind, lite[0]) as (url, server):
+    with serve_release(kind, lite[0]) as (url, server):
         assert server is not None
         for method in ("GET", "HEAD"):
             for path in ("*.h5", f"*{MANIFEST}", "*/api/*"):
@@ -317,7 +316,7 @@ def test_a_redirect_to_another_host_is_followed(lite, tmp_path):
         assert (tmp_path / "mine" / SHARD).read_bytes() == (lite[0] / SHARD).read_bytes()
 
 
-def test_the_first_file_that_fails_ends_a_download(lite, tmp_path):
+def test_download_stops_at_the_first_failing_file(lite, tmp_path):
     with http_server(lite[0]) as server:
         plan = plan_download(server.url, to=tmp_path / "mine")
         server.faults.next(Flip(3), times=ALWAYS)
@@ -329,7 +328,7 @@ def test_the_first_file_that_fails_ends_a_download(lite, tmp_path):
 
 
 def silent_server() -> socket.socket:
-    """A server that accepts connections and never answers."""
+    """Return a server that accepts connections and never answers."""
     server = socket.socket()
     server.bind(("127.0.0.1", 0))
     server.listen()
@@ -354,9 +353,9 @@ def test_a_silent_server_times_out(what, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("kind", ["http", "hub"])
 @pytest.mark.parametrize("path", ["*.h5", "*/api/*", f"*{INFO}"])
-def test_a_server_that_stops_answering(kind, path, lite, tmp_path, monkeypatch):
+def test_server_that_stops_answering_times_out(kind, path, lite, tmp_path, monkeypatch):
     monkeypatch.setattr(clients, "_TIMEOUT", 0.5)
-    with served(kind, lite[0]) as (url, server):
+    with serve_release(kind, lite[0]) as (url, server):
         assert server is not None
         server.faults.next(Slow(60), times=ALWAYS, path=path, method=None)
         began = time.monotonic()
@@ -369,38 +368,38 @@ def test_a_server_that_stops_answering(kind, path, lite, tmp_path, monkeypatch):
     assert contents(tmp_path / "mine") == contents(lite[0])
 
 
-def test_a_hub_that_has_become_unreachable_serves_its_cache(lite, tmp_path):
+def test_cached_files_can_be_read_when_the_hub_is_unreachable(lite, tmp_path):
     with hub_server(tmp_path / "hub") as hub:
         hub.add_repo("org/name", lite[0])
         fetch_planned(plan_download(HUB, layout="demo_wide"))
         hub.close()
-        assert_equal(batch(HUB), batch(lite[0]))
+        assert_equal(load_batch(HUB), load_batch(lite[0]))
         with pytest.raises(RemoteError, match=f"/{SHARD}: .*ConnectError|/{TABLE}: .*ConnectError"):
-            batch(HUB, "coord_simple")
+            load_batch(HUB, "coord_simple")
 
 
-# Trust
+# Tests of changed files and of credentials
 
 
 @pytest.mark.parametrize("kind", ["http", "hub"])
 @pytest.mark.parametrize("name", [INFO, HISTORIES, TABLE, SHARD])
-def test_a_changed_copy_is_fetched_again(kind, name, lite):
-    with served(kind, lite[0]) as (url, _):
-        assert_equal(batch(url, "coord_simple"), batch(lite[0], "coord_simple"))
+def test_changed_cached_file_is_fetched_again(kind, name, lite):
+    with serve_release(kind, lite[0]) as (url, _):
+        assert_equal(load_batch(url, "coord_simple"), load_batch(lite[0], "coord_simple"))
         path = load_icrl4aht(url).root / name
         path.resolve().write_bytes(path.read_bytes()[:-5])
-        assert_equal(batch(url, "coord_simple"), batch(lite[0], "coord_simple"))
+        assert_equal(load_batch(url, "coord_simple"), load_batch(lite[0], "coord_simple"))
         assert path.read_bytes() == (lite[0] / name).read_bytes()
 
 
 @pytest.mark.parametrize("kind", ["http", "hub"])
-def test_damaged_manifests(kind, lite, tmp_path):
+def test_damaged_remote_manifests_raise_errors(kind, lite, tmp_path):
     root = tmp_path / "release"
     shutil.copytree(lite[0], root)
     (root / MANIFEST).write_text("")
     for use in (load_icrl4aht, lambda url: plan_download(str(url))):
         with (
-            served(kind, root) as (url, _),
+            serve_release(kind, root) as (url, _),
             pytest.raises(IndexFormatError, match="empty: expected a line for each file"),
         ):
             use(url)
@@ -408,7 +407,7 @@ def test_damaged_manifests(kind, lite, tmp_path):
         server.faults.next(Flip(70), path=f"*{MANIFEST}")
         with pytest.raises(Icrl4ahtError):
             fetch_planned(plan_download(server.url))
-        assert_equal(batch(server.url), batch(lite[0]))
+        assert_equal(load_batch(server.url), load_batch(lite[0]))
 
 
 @pytest.mark.parametrize(
@@ -424,7 +423,7 @@ def test_damaged_manifests(kind, lite, tmp_path):
         ("http://127.0.0.1:9/release", RemoteError, r"MANIFEST\.sha256: .*repeat the command"),
     ],
 )
-def test_bad_addresses(url, error, message, lite, tmp_path):
+def test_invalid_addresses_raise_errors(url, error, message, lite, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "README.md").write_text("hello")
     with http_server(lite[0]) as server, hub_server(tmp_path / "hub") as hub:
@@ -436,8 +435,8 @@ def test_bad_addresses(url, error, message, lite, tmp_path):
 
 
 def test_the_token_is_sent_to_the_hub_only(lite):
-    with served("hub", lite[0]) as (url, hub):
-        batch(url)
+    with serve_release("hub", lite[0]) as (url, hub):
+        load_batch(url)
         assert isinstance(hub, Hub)
         sent = {(request.path.startswith("/cdn/"), request.headers["Authorization"]) for request in hub.log}
         assert sent == {(False, f"Bearer {hub.token}"), (True, None)}
@@ -452,7 +451,7 @@ def test_the_token_is_sent_to_the_hub_only(lite):
         ("https://u:p@ss@h.test/a@b", "https://h.test/a@b"),
     ],
 )
-def test_texts_without_credentials(text, expected):
+def test_without_credentials_removes_secrets_from_texts(text, expected):
     assert without_credentials(text) == expected
 
 
@@ -465,16 +464,16 @@ def test_unencoded_credentials_are_refused_and_hidden():
         check_credentials(address)
 
 
-def test_credentials_in_an_address_are_used_and_never_kept_or_shown(lite, tmp_path):
-    def route(request, body) -> Answer:
+def test_credentials_in_an_address_are_used_but_never_stored_or_shown(lite, tmp_path):
+    def answer_request(request, body) -> Answer:
         allowed = request.headers["Authorization"] == "Basic bWU6aHVudGVyMg==" and request.target.endswith("?key=t0ken")
         path = lite[0] / request.path.lstrip("/")
         return Answer(path) if allowed and path.is_file() else Answer(b"", 404 if allowed else 401)
 
-    said, server = [], Server(route)
+    said, server = [], Server(answer_request)
     url = f"{server.url.replace('http://', 'http://me:hunter2@')}?key=t0ken"
     try:
-        assert_equal(batch(url), batch(lite[0]))
+        assert_equal(load_batch(url), load_batch(lite[0]))
         said.append(repr(load_icrl4aht(url)))
         for command in (["download", url, "--to", str(tmp_path / "mine")], ["show", url], ["verify", url]):
             said.append(run_cli(*command))
@@ -484,6 +483,6 @@ def test_credentials_in_an_address_are_used_and_never_kept_or_shown(lite, tmp_pa
             said += [str(caught.value), str(caught.value.__cause__)]
     finally:
         server.close()
-    said += [data.decode(errors="replace") for data in contents(tmp_path).values()]
+    said += [data_folder.decode(errors="replace") for data_folder in contents(tmp_path).values()]
     said += [str(path) for path in tmp_path.rglob("*")]
     assert not [text for text in said if "hunter2" in text or "t0ken" in text]

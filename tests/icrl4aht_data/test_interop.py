@@ -1,4 +1,4 @@
-"""Loaders of PyTorch, Grain and Hugging Face over samplers."""
+"""Test loaders of PyTorch, Grain and Hugging Face that take batches from samplers."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def sampler(lite):
     return load_icrl4aht(lite[0], layout="demo_wide", obs="uint8").ad(batch_size=4, length=25, seed=6)
 
 
-class TestPasses:
+class TestLoaderPasses:
     """Regression: each pass over a loader repeated the batches of the first pass."""
 
-    def test_each_pass_over_a_torch_loader_continues(self, sampler):
+    def test_each_pass_over_a_torch_loader_returns_new_batches(self, sampler):
         loader, n = torch_loader(sampler), len(sampler)
         for number in range(3):
             assert len(loader) == n
@@ -35,7 +35,7 @@ class TestPasses:
             for i, batch in enumerate(batches, start=number * n):
                 np.testing.assert_array_equal(batch.obs, sampler[i].obs)
 
-    def test_a_resumed_loader_keeps_the_ends_of_its_passes(self, sampler):
+    def test_resumed_torch_loader_ends_its_passes_at_the_same_batches(self, sampler):
         resumed, n = torch_loader(sampler, start=len(sampler) + 3), len(sampler)
         assert len(resumed) == n - 3
         first, second = list(resumed), list(resumed)
@@ -43,7 +43,7 @@ class TestPasses:
         np.testing.assert_array_equal(first[0].obs, sampler[n + 3].obs)
         np.testing.assert_array_equal(second[0].obs, sampler[2 * n].obs)
 
-    def test_a_pass_that_is_left_early_is_not_repeated(self, sampler):
+    def test_loader_continues_with_the_next_pass_after_a_pass_is_left_early(self, sampler):
         loader = torch_loader(sampler, start=2, stop=5)
         found = [next(iter(loader)).obs for _ in range(3)]
         for i, obs in zip((2, 5, 8), found, strict=True):
@@ -51,7 +51,7 @@ class TestPasses:
 
 
 class TestGrain:
-    def test_any_number_of_threads_gives_the_same_order(self, sampler):
+    def test_grain_keeps_the_order_for_any_number_of_threads(self, sampler):
         import grain
 
         source = grain.MapDataset.source(sampler)
@@ -107,8 +107,8 @@ COMBINATIONS = [
         pytest.param(COMBINATIONS, id="all", marks=pytest.mark.slow),
     ],
 )
-def test_pytorch_workers(lite, tmp_path, combinations):
-    """Runs in a separate process, since a process that has run JAX must not fork."""
+def test_pytorch_workers_return_the_batches_of_the_sampler(lite, tmp_path, combinations):
+    """Run in a separate process, because a process that has run JAX must not fork."""
     script = tmp_path / "loader.py"
     script.write_text(TORCH)
     printed = run_python("-W", "error", "-W", ONE_CORE, script, lite[0], json.dumps(combinations))
@@ -116,18 +116,18 @@ def test_pytorch_workers(lite, tmp_path, combinations):
 
 
 class TestHuggingFace:
-    def test_index(self, lite):
+    def test_hf_index_has_one_row_per_history(self, lite):
         dataset = load_icrl4aht(lite[0], layout="demo_wide")
         assert hf_index(dataset).to_list() == [entry.to_row() for entry in dataset.entries]
 
-    def test_episodes_without_oracle_actions(self, lite, tmp_path, monkeypatch):
-        """`test_episode_files.py` compares all columns with the histories."""
+    def test_hf_episodes_have_none_for_missing_oracle_actions(self, lite, tmp_path, monkeypatch):
+        """Check a few columns; `test_episode_files.py` compares all columns with the histories."""
         monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path)
         row = hf_episodes(load_icrl4aht(lite[0], layout="demo_wide"))[8]
         assert (row["history_id"], row["episode"], row["layout"]) == (7, 2, "demo_wide")
         assert row["oracle_actions"] is None
 
-    def test_windows_and_resuming(self, sampler):
+    def test_hf_windows_equal_the_batches_and_can_be_resumed(self, sampler):
         windows = hf_windows(sampler, stop=3)
         rows = list(windows)
         assert len(rows) == 12
@@ -142,20 +142,20 @@ class TestHuggingFace:
         np.testing.assert_array_equal(next(iter(again))["obs"], rows[5]["obs"])
 
 
-def by_torch(sampler):
+def torch_batch(sampler):
     return next(iter(torch_loader(sampler, stop=1)))
 
 
-def by_hugging_face(sampler):
+def hugging_face_batch(sampler):
     rows = list(hf_windows(sampler, stop=1).with_format("torch"))
     return SimpleNamespace(**{name: torch.stack([row[name] for row in rows]) for name in rows[0]})
 
 
-@pytest.mark.parametrize("take", [by_torch, by_hugging_face])
+@pytest.mark.parametrize("take", [torch_batch, hugging_face_batch])
 class TestLosses:
-    """Regression: int32 targets are refused by PyTorch's losses, and padding was the action "up"."""
+    """Regression: PyTorch's losses refused int32 targets, and padded targets were the action `up`."""
 
-    def test_cross_entropy_accepts_the_targets(self, lite, take):
+    def test_cross_entropy_accepts_targets_and_ignores_padding(self, lite, take):
         sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=3, length=150, teammate_actions=True)
         batch = take(sampler)
         for name in ("prev_actions", "target_actions", "prev_teammate_actions"):
@@ -167,13 +167,13 @@ class TestLosses:
         np.testing.assert_allclose(loss, -logits.log_softmax(-1).numpy()[mask, targets[mask]].mean(), rtol=1e-5)
         np.testing.assert_array_equal(batch.target_actions == IGNORED, ~mask)
 
-    def test_queries(self, lite, take):
+    def test_cross_entropy_accepts_dpt_query_targets(self, lite, take):
         batch = take(load_icrl4aht(lite[0], layout="demo_wide").dpt(batch_size=3, context=7))
         assert batch.query_target.dtype == batch.context_actions.dtype == torch.int64
         assert functional.cross_entropy(torch.zeros(3, 6), batch.query_target) > 0
 
 
-def test_losses_take_the_targets_of_a_plain_data_loader(lite):
+def test_cross_entropy_accepts_targets_of_a_torch_data_loader(lite):
     ds = load_icrl4aht(lite[0], layout="demo_wide")
     samplers: list[Any] = [ds.ad(batch_size=3, length=9), ds.dpt(batch_size=3, context=7)]
     batch, queries = (next(iter(DataLoader(one, batch_size=None))) for one in samplers)

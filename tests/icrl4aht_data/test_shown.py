@@ -1,4 +1,4 @@
-"""Displayed texts: `repr`, `help()`, and types in a user's script."""
+"""Test the `repr` of objects, and run a script as users would write."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from icrl4aht_data.interop import torch_loader
 
 
 @pytest.fixture(scope="module")
-def bundled() -> Dataset:
+def bundle() -> Dataset:
     return load_icrl4aht()
 
 
-def test_objects_fit_one_screen(bundled):
-    sampler, history = bundled.filter(layout="demo_wide").ad(batch_size=2, length=30), bundled[0]
+def test_repr_of_objects_fits_one_screen(bundle):
+    sampler, history = bundle.filter(layout="demo_wide").ad(batch_size=2, length=30), bundle[0]
     report = Report("release", findings=[Finding(f"file {number}", "x" * 1000) for number in range(300)])
-    objects = [bundled, bundled.index, bundled.info, bundled.provenance, bundled.cache, history, history.entry]
+    objects = [bundle, bundle.index, bundle.info, bundle.provenance, bundle.cache, history, history.entry]
     objects += [history.actions, history.plot(), history.episodes, history.episodes[0], sampler, sampler[0], report]
     for value in objects:
         text = repr(value)
@@ -28,8 +28,8 @@ def test_objects_fit_one_screen(bundled):
         assert 1 <= lines <= 24 and " object at 0x" not in text, text
 
 
-def test_batches_print_shapes_wherever_their_arrays_are(bundled):
-    sampler = bundled.filter(layout="demo_wide").with_options(obs="uint8").ad(batch_size=2, length=30)
+def test_repr_of_batches_shows_dtypes_and_shapes(bundle):
+    sampler = bundle.filter(layout="demo_wide").with_options(obs="uint8").ad(batch_size=2, length=30)
     lines = repr(sampler[0]).splitlines()
     assert lines[0] == "ADBatch("
     assert [line.split() for line in lines[1:3]] == [
@@ -47,7 +47,7 @@ def test_batches_print_shapes_wherever_their_arrays_are(bundled):
 SCRIPT = Path(__file__).with_name("user_script.py")
 
 
-def test_the_users_script_runs(tmp_path, monkeypatch):
+def test_user_script_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(SCRIPT.read_text(), str(SCRIPT), "exec"), {})
     assert (tmp_path / "episode.gif").read_bytes().startswith(b"GIF89a")

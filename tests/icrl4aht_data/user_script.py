@@ -1,4 +1,4 @@
-"""A user's script with Grain, PyTorch and JAX; `test_shown.py` runs it, and `make check` checks its types."""
+"""User script with Grain, PyTorch and JAX, which `test_shown.py` runs and `make check` type-checks."""
 
 # pyright: reportUnnecessaryTypeIgnoreComment=error
 
@@ -28,7 +28,7 @@ print(history["rewards"].sum(), [episode.rewards.sum() for episode in ds.sample_
 sampler = train.ad(batch_size=8, length=50, seed=0)
 batch: ADBatch[np.ndarray] = sampler[np.int64(0)]
 print(batch, batch.obs.astype(np.float32).mean(), batch.is_first.sum())
-if TYPE_CHECKING:  # an error that the checker must find, as arrays of NumPy have no `at`
+if TYPE_CHECKING:  # the type checker must report an error: NumPy arrays have no `at`
     print(batch.obs.at)  # pyright: ignore[reportAttributeAccessIssue]
 
 for device_batch in sampler.batches(stop=2, device=jax.devices()[0]):

@@ -1,7 +1,7 @@
-"""Numbers that README and documentation state, computed again from the code and the bundled data.
+"""Test that numbers in README and documentation equal values computed from the code and the bundled data.
 
 A test fails if the text or the value changes. Tables and printed output are compared in `test_readme` and `test_docs`.
-Numbers that take long name the command that prints them in the text.
+For numbers that take long to compute, the text names the command that prints them.
 """
 
 from __future__ import annotations
@@ -54,16 +54,16 @@ NUMBER = rf"(-?\d[\d,]*(?:\.\d+)?(?:e\d+)?|\b(?:{'|'.join(WORDS)})\b)"
 
 
 @cache
-def histories() -> tuple[Entry, ...]:
+def entries() -> tuple[Entry, ...]:
     return tuple(read_index(MINI).entries)
 
 
 def rising_histories() -> tuple[float, ...]:
-    rising = [entry for entry in histories() if entry.return_end - entry.return_start >= LEAST_HEADROOM]
-    return len(histories()), len(rising), LEAST_HEADROOM
+    rising = [entry for entry in entries() if entry.return_end - entry.return_start >= LEAST_HEADROOM]
+    return len(entries()), len(rising), LEAST_HEADROOM
 
 
-def best_responses_by_split() -> tuple[int, int]:
+def count_best_responses() -> tuple[int, int]:
     found = read_best_responses().behaviours
     assert {(len(one.seeds), one.split) for one in found} == {(1, "test")}
     assert {training.width for one in found for training in one.seeds} == {64}
@@ -75,13 +75,13 @@ def cells_without_headroom() -> tuple[int, int]:
     return sum(not has_headroom(cell) for cell in cells), len(cells)
 
 
-def tasks(split: str, kind: Literal["", "diverse"] = "") -> list[Task]:
+def bundled_tasks(split: str, kind: Literal["", "diverse"] = "") -> list[Task]:
     """Return the bundled tasks of a split of both tracks."""
     return [task for track in TRACKS for task in read_tasks(manifest_path(track, split, kind))]
 
 
-def plan_of_the_paper() -> tuple[float, ...]:
-    """Environment steps, recorded and kept transitions of the profile `paper`."""
+def paper_plan_sizes() -> tuple[float, ...]:
+    """Return learners, environment steps, recorded and kept transitions of the profile `paper`."""
     profile = load_profile("paper")
     ego, count = profile.ego, sum(profile.tasks_on(name, "ppo") for name in profile.layouts)
     steps = ego.episodes * KEPT_STEPS
@@ -89,28 +89,28 @@ def plan_of_the_paper() -> tuple[float, ...]:
     return count, total, count * ego.environments * steps, count * profile.keep * steps
 
 
-def bytes_of_records() -> tuple[int, int]:
+def record_size_range() -> tuple[int, int]:
     sizes = [record_size(layout) for layout in LAYOUTS.values()]
     return min(sizes), max(sizes)
 
 
-def channels_of_layouts() -> tuple[int, int]:
+def channel_count_range() -> tuple[int, int]:
     channels = [layout.channels for layout in LAYOUTS.values()]
     return min(channels), max(channels)
 
 
-def validation_by_layout() -> int:
-    return max(Counter(task.layout.name for task in tasks("validation")).values())
+def most_validation_tasks_of_a_layout() -> int:
+    return max(Counter(task.layout.name for task in bundled_tasks("validation")).values())
 
 
-def tiny_size() -> tuple[int, int, int]:
+def tiny_model_size() -> tuple[int, int, int]:
     assert (TINY_SIZE.encoder, TINY_SIZE.positions) == ("mlp", "rope")
     return TINY_SIZE.layers, TINY_SIZE.width, TINY_SIZE.context
 
 
-def behaviours_of_tests() -> tuple[int, ...]:
-    """Return the behaviours and tasks of all cells, then the behaviours of the cells that the protocol names."""
-    by_id = {task.task_id: task for task in tasks("test")}
+def count_test_behaviours() -> tuple[int, ...]:
+    """Return counts of test behaviours and test tasks, then behaviour counts of cells named in docs/protocol.md."""
+    by_id = {task.task_id: task for task in bundled_tasks("test")}
     counts = Counter((task.layout.name, task.teammate_family) for task in by_id.values())
     for first, *others in same_behaviour_tasks():
         counts[by_id[first].layout.name, by_id[first].teammate_family] -= len(others)
@@ -121,34 +121,34 @@ def behaviours_of_tests() -> tuple[int, ...]:
     return total, len(by_id), *named, rest
 
 
-def uncooperative_modes() -> int:
-    return TERRITORY.choices["behavior_mode"] - 1  # all but the normal one
+def count_uncooperative_modes() -> int:
+    return TERRITORY.choices["behavior_mode"] - 1  # all modes except the normal mode
 
 
-def size_of_the_bundle() -> tuple[int, ...]:
+def bundled_release_size() -> tuple[int, ...]:
     size = sum(path.stat().st_size for path in MINI.rglob("*") if path.is_file())
-    layouts, tasks_ = {entry.layout for entry in histories()}, {entry.task_id for entry in histories()}
-    return len(histories()), len(tasks_), len(layouts), sum(entry.T for entry in histories()), round(size / 1e6)
+    layouts, tasks_ = {entry.layout for entry in entries()}, {entry.task_id for entry in entries()}
+    return len(entries()), len(tasks_), len(layouts), sum(entry.T for entry in entries()), round(size / 1e6)
 
 
 CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("README", "Of the {} bundled histories, {} earn at least {} more", rising_histories),
-    ("README", "{} histories of {} tasks on {} layouts: {} steps in {} MB", size_of_the_bundle),
+    ("README", "{} histories of {} tasks on {} layouts: {} steps in {} MB", bundled_release_size),
     ("README", "a delivery is worth {}.", lambda: DELIVERY_REWARD),
     ("README", "more than `stay` in {} of the {} cells", cells_without_headroom),
-    ("docs/index", "benchmark's {} test tasks", lambda: len(tasks("test"))),
-    ("docs/evaluating", "There are {} published test tasks", lambda: len(tasks("test"))),
+    ("docs/index", "benchmark's {} test tasks", lambda: len(bundled_tasks("test"))),
+    ("docs/evaluating", "There are {} published test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/evaluating", "of {} episodes with {} steps each", lambda: (SEEDED.episodes, SEEDED.steps)),
     ("docs/evaluating", "canonical channels, the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
     ("docs/evaluating", "more than `stay` in {} of the {} cells", cells_without_headroom),
-    ("docs/protocol", "choices.md): up to {} [drawn", validation_by_layout),
+    ("docs/protocol", "choices.md): up to {} [drawn", most_validation_tasks_of_a_layout),
     ("docs/protocol", "scripts of {} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),
-    ("docs/protocol", "{} of its modes do not cooperate", uncooperative_modes),
+    ("docs/protocol", "{} of its modes do not cooperate", count_uncooperative_modes),
     (
         "docs/protocol",
         "have {} behaviours of {} tasks (`cards/behaviours.json`). H4 has one behaviour on every layout. H1 "
         "has {} behaviours on cramped_down, H2 has {} on test_wide, and all other cells have {}.",
-        behaviours_of_tests,
+        count_test_behaviours,
     ),
     ("docs/protocol", "its oldest {} is dropped", lambda: dropped_steps(500) / 500),
     ("docs/protocol", "{} steps in profile `paper`", lambda: load_profile("paper").ego.shaping_horizon),
@@ -174,9 +174,9 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
         "{} % `train`, {} % `validation`, {} % `test`",
         lambda: tuple(100 * share for share in LAYOUT_SPLITS.values()),
     ),
-    ("docs/publishing", "of every step ({} to {} bytes)", bytes_of_records),
-    ("docs/loading", "Layouts have {} to {} channels", channels_of_layouts),
-    ("docs/training", "`--size tiny`: {} layers of width {}, one dense layer as the encoder, K = {}", tiny_size),
+    ("docs/publishing", "of every step ({} to {} bytes)", record_size_range),
+    ("docs/loading", "Layouts have {} to {} channels", channel_count_range),
+    ("docs/training", "`--size tiny`: {} layers of width {}, one dense layer as the encoder, K = {}", tiny_model_size),
     ("docs/training", "its {} steps take two cores", lambda: TINY_SIZE.steps),
     ("docs/training", "A checkpoint is written every {} minutes", lambda: SAVE_MINUTES),
     ("docs/training", "A {} of the histories are held out", lambda: HistoryOptions(("demo_wide",)).held_out),
@@ -186,16 +186,16 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     (
         "docs/scale",
         "tasks {} learners 640 environment steps {} recorded transitions {} kept transitions {}",
-        plan_of_the_paper,
+        paper_plan_sizes,
     ),
-    ("docs/choices", "{} behaviours on {} layouts have one so far", best_responses_by_split),
+    ("docs/choices", "{} behaviours on {} layouts have one so far", count_best_responses),
     ("docs/choices", "plays on {} rearranged versions", lambda: reference.TRACK_PLAY["layout"]["rearranged"]),
 ]
 """Page, text with {} for each number, and what computes these numbers."""
 
 
 def stated_numbers(page: str, claim: str) -> list[str]:
-    """Return the numbers of a page at the places {} of a claim, whose words stand there once."""
+    """Return the numbers that a page states in place of each {} of a claim; the claim must occur exactly once."""
     pattern = r"\s+".join(re.escape(word).replace(r"\{\}", NUMBER) for word in claim.split())
     found = list(re.finditer(pattern, (ROOT / f"{page}.md").read_text(encoding="utf-8")))
     assert len(found) == 1, f"{page}.md has {claim!r} {len(found)} times"
@@ -203,7 +203,7 @@ def stated_numbers(page: str, claim: str) -> list[str]:
 
 
 @pytest.mark.parametrize(("page", "claim", "compute"), CLAIMS, ids=[f"{page}: {claim}" for page, claim, _ in CLAIMS])
-def test_stated_numbers_are_those_of_code_and_data(page, claim, compute):
+def test_stated_numbers_equal_values_from_code_and_data(page, claim, compute):
     stated, computed = stated_numbers(page, claim), compute()
     computed = computed if isinstance(computed, tuple) else (computed,)
     assert len(stated) == len(computed)

@@ -1,4 +1,4 @@
-"""The pages of docs/: snippets print the shown output, commands are valid, tables and names match the code."""
+"""Test the pages of docs/: snippets print the shown output, commands are valid, tables and names match the code."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tests.helpers.paths import ROOT
 from tests.helpers.plugins import installed, write_package
 from tests.helpers.random_releases import random_history, random_release
 from tests.helpers.tiny import TINY
-from tests.packaging.test_readme import blocks, commands, understand
+from tests.packaging.test_readme import check_arguments, code_blocks, shell_calls
 from tests.servers.hub import hub_server
 from tests.servers.process import uploads
 
@@ -53,10 +53,10 @@ COMPILING = ("adapters", "evaluating", "protocol")
 
 
 def run_snippets(page: str, folder: Path) -> dict[str, Any]:
-    """Run a page's snippets in order, in a folder with the package's data, and return the names they define.
+    """Run a page's snippets in order in a folder with the package's data; return the names that snippets define.
 
-    Each must print exactly the text block that follows it, where "..." is the folder of the package. Line numbers in
-    tracebacks are those of the page.
+    Each snippet must print exactly the text block after the snippet, where "..." stands for the package's folder.
+    Line numbers in tracebacks count the lines of the page.
     """
     names: dict[str, Any] = {}
     (folder / "icrl4aht_data").symlink_to(ROOT / "icrl4aht_data")
@@ -69,8 +69,8 @@ def run_snippets(page: str, folder: Path) -> dict[str, Any]:
     return names
 
 
-def rows(page: str, heading: str) -> list[list[str]]:
-    """Return the cells of the Markdown table whose first column has this heading, without backticks."""
+def table_rows(page: str, heading: str) -> list[list[str]]:
+    """Return the rows of the Markdown table with this heading of the first column, as cells without backticks."""
     (table,) = re.findall(rf"^\| {heading} \|.*?\n\|[-|]+\n((?:\|.*\n)+)", PAGES[page], flags=re.MULTILINE)
     return [[cell.strip().replace("`", "") for cell in line.strip("| ").split(" | ")] for line in table.splitlines()]
 
@@ -80,36 +80,36 @@ def rows(page: str, heading: str) -> list[list[str]]:
     [
         pytest.param(page, marks=pytest.mark.slow if page in COMPILING else ())
         for page in PAGES
-        if blocks("python", PAGES[page]) and page != "extending"
+        if code_blocks("python", PAGES[page]) and page != "extending"
     ],
 )
-def test_snippets(page, tmp_path, monkeypatch):
+def test_snippets_print_the_shown_output(page, tmp_path, monkeypatch):
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))  # a page sets it
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))  # a snippet changes this variable
     monkeypatch.setattr(MemoryFileSystem, "store", {})
     assert run_snippets(page, tmp_path)
 
 
 @pytest.fixture
-def own_package(tmp_path) -> Iterator[None]:
-    """The package docs/my_overcooked, installed."""
-    with installed(write_own_package(tmp_path / "site")):
+def example_package(tmp_path) -> Iterator[None]:
+    """Install the example package docs/my_overcooked during a test."""
+    with installed(write_example_package(tmp_path / "site")):
         yield
 
 
 @EVERY_PAGE
-def test_commands_are_accepted(page, request, tmp_path, monkeypatch):
-    """The commands are not run: most of them would take too long here."""
+def test_commands_of_pages_are_accepted(page, request, tmp_path, monkeypatch):
+    """Check only the arguments, because running the commands would take too long."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "shared" / "lite").mkdir(parents=True)
     (tmp_path / "icrl4aht_data").symlink_to(ROOT / "icrl4aht_data")
     if page == "extending":
-        request.getfixturevalue("own_package")
+        request.getfixturevalue("example_package")
         (tmp_path / "mine.jsonl").touch()
-    for line in "".join(blocks("sh", PAGES[page])).splitlines():
+    for line in "".join(code_blocks("sh", PAGES[page])).splitlines():
         assert line.startswith(("icrl4aht-data", "ray "))
-    for arguments in commands(PAGES[page]):
-        understand(cli, arguments)
+    for arguments in shell_calls(PAGES[page]):
+        check_arguments(cli, arguments)
     for words in re.findall(r"`icrl4aht-data ((?:research )?[a-z][a-z-]*)", PAGES[page]):
         assert words in all_verbs(), words
 
@@ -118,28 +118,28 @@ def test_commands_are_accepted(page, request, tmp_path, monkeypatch):
     "arguments",
     [
         pytest.param(arguments, marks=[pytest.mark.slow] * ("--deep" in arguments), id=" ".join(arguments))
-        for arguments in commands(PAGES["start"])
+        for arguments in shell_calls(PAGES["start"])
     ],
 )
-def test_first_commands(arguments, tmp_path, monkeypatch):
+def test_commands_of_the_start_page_run(arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_cli(*arguments)
 
 
 @pytest.mark.slow
 @uploads
-def test_hub_commands(tmp_path, monkeypatch):
-    """Upload the bundled release to a local hub, then read it from there: the commands of both pages in their order."""
+def test_upload_and_download_commands_of_pages_run(tmp_path, monkeypatch):
+    """Run the commands of two pages: upload the bundled release to a local hub, then read the release from the hub."""
     monkeypatch.chdir(tmp_path)
     with hub_server(tmp_path / "hub") as hub:
         for page in ("publishing", "remote"):
-            for arguments in commands(PAGES[page]):
+            for arguments in shell_calls(PAGES[page]):
                 run_cli(*arguments)
         assert "README.md" in hub.files("you/icrl4aht")
 
 
 @EVERY_PAGE
-def test_names_exist(page):
+def test_names_in_pages_exist(page):
     text = PAGES[page]
     for name in re.findall(r"`((?:icrl4aht_data|generation|baselines)(?:\.\w+)+)(?:\(.*?\))?`", text):
         assert pydoc.locate(name) is not None, name
@@ -151,12 +151,12 @@ def test_names_exist(page):
 
 @pytest.fixture(scope="module")
 def reader() -> dict[str, Any]:
-    """The functions of docs/read_release.py."""
+    """Return the functions of docs/read_release.py, by name."""
     return runpy.run_path(str(DOCS / "read_release.py"))
 
 
-class TestFormat:
-    def test_reading_gives_the_arrays_of_the_package(self, reader, lite, full, tmp_path):
+class TestFormatPage:
+    def test_read_release_script_returns_the_arrays_of_the_package(self, reader, lite, full, tmp_path):
         to_release(load_icrl4aht(full[0]), tmp_path / "observations", "observations")
         random_release(tmp_path / "shards", labels=False, shard_histories=4)
         random_release(tmp_path / "oracle", layouts=("coord_simple",), oracle=True)
@@ -171,7 +171,7 @@ class TestFormat:
         with pytest.raises(KeyError):
             reader["read"](tmp_path / "shards", 0, "expert_actions")
 
-    def test_a_damaged_byte_is_an_error(self, reader, damaged):
+    def test_read_release_script_raises_error_on_damaged_bytes(self, reader, damaged):
         shard = damaged / load_icrl4aht(damaged).entries[0].shard
         table = np.load(damaged / "meta/chunks" / shard.relative_to(damaged / "data").with_suffix(".npy"))
         flip_bit(shard, int(table["offset"][0]) + 5)
@@ -179,7 +179,7 @@ class TestFormat:
             reader["read"](damaged, 0, "state")
 
     @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=str)
-    def test_records_and_observations(self, reader, layout):
+    def test_read_release_script_unpacks_and_observes_like_the_package(self, reader, layout):
         parsed = reader["parse_layout"]({"map": layout.rows, "obs_shape": layout.obs_shape})
         assert parsed["S"] == state.record_size(layout)
         for part in ("pots", "buttons", "counters"):
@@ -192,25 +192,27 @@ class TestFormat:
             for agent in (0, 1):
                 np.testing.assert_array_equal(reader["observe"](parsed, record, agent), observe(layout, record, agent))
 
-    def test_canonical_channels(self, reader):
+    def test_read_release_script_has_the_canonical_channels_of_the_package(self, reader):
         for layout in LAYOUTS.values():
             parsed = reader["parse_layout"]({"map": layout.rows, "obs_shape": layout.obs_shape})
             assert reader["canonical_positions"](parsed) == canonical_positions(layout).tolist()
 
-    def test_arrays_are_those_of_the_schema(self):
-        arrays = [cells[:5] for cells in rows("format", "array")]
+    def test_format_page_lists_the_arrays_of_the_schema(self):
+        arrays = [cells[:5] for cells in table_rows("format", "array")]
         assert arrays == [
             [field.name, field.axis, str(field.chunk), stored_type(field, "full"), stored_type(field, "lite")]
             for field in FIELDS.values()
         ]
 
-    def test_every_file_of_a_release_is_listed(self):
-        patterns = [re.sub("<.*?>", "*", name) for cells in rows("format", "path") for name in cells[0].split(", ")]
+    def test_format_page_lists_every_file_of_a_release(self):
+        patterns = [
+            re.sub("<.*?>", "*", name) for cells in table_rows("format", "path") for name in cells[0].split(", ")
+        ]
         for path in (path for path in MINI.rglob("*") if path.is_file()):
             assert any(path.match(pattern) for pattern in patterns), path
 
     @pytest.mark.skipif(shutil.which("sha256sum") is None, reason="needs sha256sum")
-    def test_sha256sum_reads_the_manifest(self):
+    def test_sha256sum_command_accepts_the_manifest(self):
         (command,) = re.findall(r"`(sha256sum .*?)`", PAGES["format"])
         subprocess.run([*command.split(), "--quiet"], cwd=MINI, check=True)
 
@@ -219,7 +221,7 @@ TYPE_NAMES = {"int32": "i4", "int8": "i1", "float32": "f4", "bool": "bool"}
 
 
 def stored_type(field: Field, kind: Kind) -> str:
-    """Return the stored element type of an array in the notation of docs/format.md; "-" if it is not stored."""
+    """Return the stored element type of an array in the notation of docs/format.md; "-" for arrays not stored."""
     if kind in field.absent:
         return "-"
     if field.row != "scalar":
@@ -231,8 +233,8 @@ SMALL = "--steps 3 --width 16 --heads 2 --batch-size 2 --context 40"
 """Options of a training that takes seconds."""
 
 
-def write_own_package(folder: Path) -> Path:
-    """Write the package docs/my_overcooked as if it was installed; returns the folder for Python's path."""
+def write_example_package(folder: Path) -> Path:
+    """Write the package docs/my_overcooked like an installed package; return the folder for PYTHONPATH."""
     source = DOCS / "my_overcooked"
     project = tomllib.loads((source / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     modules = {path.stem: path.read_text(encoding="utf-8") for path in (source / "my_overcooked").glob("*.py")}
@@ -240,16 +242,16 @@ def write_own_package(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_extending(tmp_path, monkeypatch):
-    """Run the snippets, then the commands, which are processes of their own."""
-    package = write_own_package(tmp_path / "site")
+def test_snippets_and_commands_of_the_extending_page_run(tmp_path, monkeypatch):
+    """Run the snippets, then run each command in a separate process."""
+    package = write_example_package(tmp_path / "site")
     (tmp_path / "page").mkdir()
     with installed(package), mock.patch.dict(METHODS):
         names = run_snippets("extending", tmp_path / "page")
     assert names["task"].teammate_family == "waiter"
     shutil.copy(tmp_path / "page/mine.jsonl", tmp_path)
     (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")
-    for line in blocks("sh", PAGES["extending"])[0].splitlines():
+    for line in code_blocks("sh", PAGES["extending"])[0].splitlines():
         line = line.replace("--profile smoke", "--profile tiny.toml").replace("--steps 2000", SMALL)
         run_python("-m", "icrl4aht_data", *line.split()[1:], cwd=tmp_path, PYTHONPATH=str(package))
     report = (tmp_path / "runs/oracle/report/report.md").read_text(encoding="utf-8")
@@ -257,14 +259,14 @@ def test_extending(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "runs/mean_open/config.json").read_text(encoding="utf-8"))["method"] == "mean_ad"
 
 
-def test_listed_variables_are_those_that_the_code_reads():
+def test_scale_page_lists_the_environment_variables_of_the_code():
     sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "icrl4aht_data").rglob("*.py"))
     used = set(re.findall(r'"((?:ICRL4AHT|HF)_[A-Z_]+)"', sources))
-    listed = {name for cells in rows("scale", "variable") for name in cells[0].split(", ")}
+    listed = {name for cells in table_rows("scale", "variable") for name in cells[0].split(", ")}
     assert used <= listed
     assert {name for name in listed if name.startswith("ICRL4AHT")} <= used
 
 
-def test_published_returns_are_those_of_headroom_json():
+def test_published_returns_in_pages_equal_headroom_json():
     table = published_table(json.loads(card_file("headroom.json").read_text())["published"])
     assert table in PAGES["evaluating"] and table in card_file("headroom.md").read_text()

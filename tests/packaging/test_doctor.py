@@ -1,4 +1,4 @@
-"""`icrl4aht-data doctor`: reports on a valid installation, and on each problem that one can have."""
+"""Test that `icrl4aht-data doctor` accepts a valid installation and reports each possible problem."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ verified_once = functools.cache(verify_release)
 
 
 @pytest.fixture
-def elsewhere(tmp_path, monkeypatch) -> Path:
-    """Folders of this test, none of which exists yet; JAX is replaced by a fixed answer."""
+def doctor_folder(tmp_path, monkeypatch) -> Path:
+    """Set new cache and data folders and a fixed answer for JAX; return the parent of the folders."""
     for name in ("CACHE", "DATA"):
         monkeypatch.setenv(f"ICRL4AHT_{name}_DIR", str(tmp_path / name.lower()))
     for name in ("ICRL4AHT_OFFLINE", "HF_HUB_OFFLINE", "ICRL4AHT_REMOTE", "ICRL4AHT_CACHE_BYTES"):
@@ -36,7 +36,7 @@ def elsewhere(tmp_path, monkeypatch) -> Path:
 
 
 def run_doctor(code: int = 0) -> tuple[dict[str, Any], str]:
-    """Run the command, which exits with `code`; returns its JSON and its text."""
+    """Run the doctor, which must exit with `code`; return the JSON facts and the printed text."""
     text, facts = run_cli("doctor", code=code), json.loads(run_cli("doctor", "--json", code=code))
     assert code == bool(facts["problems"]) == (not facts["ok"])
     for each in facts["problems"]:
@@ -44,94 +44,94 @@ def run_doctor(code: int = 0) -> tuple[dict[str, Any], str]:
     return facts, text
 
 
-def problems() -> dict[str, str]:
-    """Run the command; returns problem -> next step."""
+def reported_problems() -> dict[str, str]:
+    """Run the doctor, which must find problems; return problem -> next step."""
     return {each["problem"]: each["next_step"] for each in run_doctor(1)[0]["problems"]}
 
 
-def test_no_problems(elsewhere):
+def test_doctor_finds_no_problems_in_a_valid_installation(doctor_folder):
     facts, text = run_doctor()
     assert facts["ok"], facts["problems"]
     for expected in (
         f"icrl4aht-data: {importlib.metadata.version('icrl4aht-data')}",
         f"HDF5: {h5py.version.hdf5_version}",
         '"backend": "cpu"',
-        f'cache: {{"path": "{elsewhere / "cache"}"',
+        f'cache: {{"path": "{doctor_folder / "cache"}"',
         "no problems found",
     ):
         assert expected in text
-    assert not list(elsewhere.iterdir()), "the doctor creates nothing"
+    assert not list(doctor_folder.iterdir()), "the doctor creates nothing"
     assert facts["bundled"] == {"ok": True}
     assert facts["packages"]["numpy"] == importlib.metadata.version("numpy")
     assert facts["devices"]["jax"] == {"backend": "cpu", "devices": ["cpu"]}
     assert facts["network"] == {"offline": [], "remote": None}
 
 
-def test_jax_is_imported_in_another_process(elsewhere):
+def test_doctor_imports_jax_in_another_process(doctor_folder):
     code = "import sys; from icrl4aht_data.commands import doctor; print(doctor._devices({}), 'jax' in sys.modules)"
     done = run_python("-c", code)
     assert "'jax': {'backend': " in done and done.endswith("False\n")
 
 
-def test_folders_that_cannot_be_written(elsewhere, monkeypatch):
-    (elsewhere / "cache").write_text("a file")
-    found = problems()
-    assert found[f"{elsewhere / 'cache'}: the cache folder cannot be written: Not a directory"] == (
+def test_doctor_reports_folders_that_cannot_be_written(doctor_folder, monkeypatch):
+    (doctor_folder / "cache").write_text("a file")
+    found = reported_problems()
+    assert found[f"{doctor_folder / 'cache'}: the cache folder cannot be written: Not a directory"] == (
         "set ICRL4AHT_CACHE_DIR to another folder, or make it writable"
     )
 
-    def refuse(dir: Path) -> None:
+    def raise_permission_error(dir: Path) -> None:
         raise PermissionError(13, "Permission denied", str(dir))
 
-    monkeypatch.setattr(doctor.tempfile, "TemporaryFile", refuse)
-    assert f"{elsewhere / 'data'}: the data folder cannot be written: Permission denied" in problems()
+    monkeypatch.setattr(doctor.tempfile, "TemporaryFile", raise_permission_error)
+    assert f"{doctor_folder / 'data'}: the data folder cannot be written: Permission denied" in reported_problems()
 
 
 @pytest.mark.parametrize("value", ["many", "-5"])
-def test_invalid_settings(elsewhere, monkeypatch, value):
+def test_doctor_reports_invalid_environment_variables(doctor_folder, monkeypatch, value):
     monkeypatch.setenv("ICRL4AHT_CACHE_BYTES", value)
     monkeypatch.setenv("ICRL4AHT_REMOTE", "example.org/icrl4aht")
-    cache, remote = problems()
+    cache, remote = reported_problems()
     assert cache == f"ICRL4AHT_CACHE_BYTES={value!r}: expected a number of bytes, such as 2e11"
     assert remote == "ICRL4AHT_REMOTE='example.org/icrl4aht': expected an address"
 
 
-def test_damaged_bundled_release(elsewhere, monkeypatch, damaged):
+def test_doctor_reports_a_damaged_bundled_release(doctor_folder, monkeypatch, damaged):
     shard = damaged / SHARD
     shard.write_bytes(shard.read_bytes()[:-1])
     monkeypatch.setattr(doctor, "MINI", damaged)
     monkeypatch.setattr(doctor, "verify_release", verify_release)
-    ((problem, step),) = problems().items()
+    ((problem, step),) = reported_problems().items()
     assert problem.startswith(f"the bundled release, {SHARD}: ")
     assert step == RESTORE
     (damaged / "meta/info.json").unlink()
-    assert any("meta/info.json" in problem for problem in problems())
+    assert any("meta/info.json" in problem for problem in reported_problems())
 
 
-def test_versions_that_are_not_accepted(elsewhere, monkeypatch):
+def test_doctor_reports_unsupported_package_versions(doctor_folder, monkeypatch):
     installed = {"numpy": "1.26.4", "matplotlib": "3.0", "rich": None, "pillow": None}
 
-    def version(name: str) -> str:
+    def fake_version(name: str) -> str:
         found = installed.get(name, importlib.metadata.version(name))
         if found is None:
             raise importlib.metadata.PackageNotFoundError(name)
         return found
 
-    monkeypatch.setattr(doctor, "version", version)
-    found = problems()
+    monkeypatch.setattr(doctor, "version", fake_version)
+    found = reported_problems()
     assert found.pop("numpy 1.26.4: expected >=2.1") == "pip install -U 'numpy>=2.1'"
     assert set(found) == {"matplotlib 3.0: expected >=3.9", "rich is not installed: expected >=13"}
     assert f"pillow: not installed: {install_command('plot')}" in run_doctor(1)[1], "extras are optional"
 
 
-def test_broken_jax(elsewhere, monkeypatch):
+def test_doctor_reports_a_broken_jax(doctor_folder, monkeypatch):
     monkeypatch.setattr(doctor, "_query_jax", QUERY_JAX)
     monkeypatch.setattr(doctor, "_JAX_CODE", "raise ImportError('libcuda.so is another version')")
-    assert any("JAX cannot be used: ImportError: libcuda.so" in problem for problem in problems())
+    assert any("JAX cannot be used: ImportError: libcuda.so" in problem for problem in reported_problems())
 
 
-def test_every_optional_package_has_its_extra(elsewhere):
-    """The constant hints agree with the metadata of the installed package."""
+def test_install_hints_name_extras_that_contain_the_package(doctor_folder):
+    """Compare the constant EXTRAS with the metadata of the installed package."""
     listed = [Requirement(line) for line in importlib.metadata.requires("icrl4aht-data") or []]
     for name, extra in EXTRAS.items():
         found = [one for one in listed if one.name == name and one.marker and one.marker.evaluate({"extra": extra})]
@@ -139,8 +139,8 @@ def test_every_optional_package_has_its_extra(elsewhere):
     assert EXTRAS.keys() <= run_doctor()[0]["packages"].keys()
 
 
-def test_what_is_no_problem_is_shown(elsewhere, monkeypatch):
-    """Offline mode, and a GPU that JAX does not use."""
+def test_doctor_shows_offline_mode_and_an_unused_gpu(doctor_folder, monkeypatch):
+    """Offline mode and a GPU that JAX does not use are shown, but are no problems."""
     monkeypatch.setenv("ICRL4AHT_OFFLINE", "1")
     monkeypatch.setattr(shutil, "which", lambda name: name)
     facts, text = run_doctor()

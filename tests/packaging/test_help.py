@@ -1,4 +1,4 @@
-"""The help of the program: every command is listed, explained and found; it is printed before anything is imported."""
+"""Test the program's help: every command is listed, explained and found, and help imports no command."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from icrl4aht_data.commands.cli import VerbGroup, all_verbs, cli
 from icrl4aht_data.commands.verbs import Verb
 from tests.helpers.commands import run_cli, run_python
-from tests.packaging.test_readme import understand
+from tests.packaging.test_readme import check_arguments
 
 PUBLIC = (
     "list show browse verify download convert combine release upload doctor generate teammates layouts plan check "
@@ -23,8 +23,8 @@ PUBLIC = (
 RESEARCH = "draws manifests diversity reference headroom proof"
 
 
-def find(verb: Verb) -> click.Command:
-    """Return a command as the program finds it."""
+def find_command(verb: Verb) -> click.Command:
+    """Find the click command of a verb in the program's groups of commands."""
     command: click.Command | None = cli
     for word in verb.name.split():
         assert isinstance(command, VerbGroup)
@@ -33,7 +33,7 @@ def find(verb: Verb) -> click.Command:
     return command
 
 
-def test_every_command_exists():
+def test_program_has_exactly_the_expected_commands():
     assert set(cli.list_commands(click.Context(cli))) == {*PUBLIC.split(), "research"}
     assert {name for name in all_verbs() if " " in name} == {f"research {one}" for one in RESEARCH.split()} | {
         "release build"
@@ -41,8 +41,8 @@ def test_every_command_exists():
 
 
 @pytest.mark.parametrize("words", all_verbs())
-def test_help(words):
-    command = find(all_verbs()[words])
+def test_every_command_has_complete_help(words):
+    command = find_command(all_verbs()[words])
     run_cli(*words.split(), "--help")
     assert (command.help or "").splitlines()[0] == all_verbs()[words].help, "the table and the command's own text"
     assert command.get_short_help_str(62) == all_verbs()[words].help, "a list of commands shows it completely"
@@ -50,8 +50,8 @@ def test_help(words):
         assert not isinstance(option, click.Option) or option.help, f"{option.name} has no help"
 
 
-def test_the_programs_help_imports_no_command():
-    """No JAX either; it takes less than half a second of CPU time on one core, mostly for NumPy."""
+def test_help_of_the_program_imports_no_command():
+    """Without commands and JAX, help takes less than half a second of CPU time on one core, mostly for NumPy."""
     code = "import sys; from icrl4aht_data.commands.cli import cli; cli(['--help'], standalone_mode=False); "
     code += "print('loaded:', *sys.modules)"
     text, _, loaded = run_python("-c", code).partition("loaded: ")
@@ -60,23 +60,23 @@ def test_the_programs_help_imports_no_command():
     assert not {*targets, "jax", "h5py", "rich", "icrl4aht_data.dataset"} & {*loaded.split()}
 
 
-def test_a_research_command_without_its_group_is_named():
+def test_research_command_without_its_group_suggests_the_full_command():
     printed = run_cli("draws", "--overwrite", code=2)
     assert "icrl4aht-data research draws --overwrite" in printed
 
 
-def examples() -> list[str]:
-    epilogs = [find(verb).epilog or "" for verb in all_verbs().values()] + [cli.epilog or ""]
+def help_examples() -> list[str]:
+    epilogs = [find_command(verb).epilog or "" for verb in all_verbs().values()] + [cli.epilog or ""]
     return sorted({line.strip() for text in epilogs for line in text.splitlines() if line.startswith("  icrl4aht")})
 
 
-@pytest.mark.parametrize("line", examples())
-def test_examples_are_valid(line):
-    understand(cli, shlex.split(line)[1:])
+@pytest.mark.parametrize("line", help_examples())
+def test_examples_in_help_are_valid(line):
+    check_arguments(cli, shlex.split(line)[1:])
 
 
-def completed(*words: str) -> list[str]:
-    """Return what the console script offers in bash after these words."""
+def bash_completions(*words: str) -> list[str]:
+    """Return the completions that the console script offers in bash after some words."""
     line = " ".join(("icrl4aht-data", *words))
     request = {"_ICRL4AHT_DATA_COMPLETE": "bash_complete", "COMP_WORDS": line, "COMP_CWORD": str(len(words))}
     path = Path(sys.executable).with_name("icrl4aht-data")
@@ -85,7 +85,7 @@ def completed(*words: str) -> list[str]:
     return [offer.partition(",")[2] for offer in done.stdout.splitlines()]
 
 
-def test_completion():
-    assert completed("ver") == ["verify"]
-    assert completed("list", "--layout", "demo_") == ["demo_simple", "demo_wide"]
-    assert "--json" in completed("doctor", "--")
+def test_bash_completion_offers_commands_and_values():
+    assert bash_completions("ver") == ["verify"]
+    assert bash_completions("list", "--layout", "demo_") == ["demo_simple", "demo_wide"]
+    assert "--json" in bash_completions("doctor", "--")

@@ -1,4 +1,4 @@
-"""The order of packages and folders that imports follow, and the libraries that importing the reader loads."""
+"""Test the order of imports between packages and folders, and the libraries that the reader imports."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ HEAVY = {*JAX, *PICTURES, "torch", "datasets", "huggingface_hub", "grain", "pyar
 
 
 class Import(NamedTuple):
-    """One import statement's target.
+    """Target of one import statement.
 
     Attributes:
-        importer: the importing module, "package.folder.file".
-        imported: the imported module, own or of a library.
-        place: "top", "function" or "types" (under TYPE_CHECKING).
+        importer: name of the importing module, such as "package.folder.file".
+        imported: name of the imported module, of this project or of a library.
+        place: where the statement is: "top", "function" or "types" (under TYPE_CHECKING).
     """
 
     importer: str
@@ -66,8 +66,8 @@ def imports_of(importer: str, node: ast.AST, modules: set[str], place: str = "to
 
 
 @cache
-def project() -> tuple[set[str], list[Import]]:
-    """Return the names of all modules, and their imports."""
+def project_imports() -> tuple[set[str], list[Import]]:
+    """Return the names of all modules of the project, and all imports in these modules."""
     paths = {
         ".".join((name, *path.relative_to(folder).with_suffix("").parts)).removesuffix(".__init__"): path
         for name, folder in PACKAGES.items()
@@ -78,9 +78,9 @@ def project() -> tuple[set[str], list[Import]]:
     return modules, [found for name, tree in trees.items() for found in imports_of(name, tree, modules)]
 
 
-def test_imports_go_down():
-    """No import is of a package or folder that comes later in `ORDER`."""
-    modules, imports = project()
+def test_modules_import_only_lower_packages_and_folders():
+    """No module may import a package or folder that comes later in `ORDER`."""
+    modules, imports = project_imports()
     faults = []
     for found in imports:
         if found.imported not in modules:
@@ -89,43 +89,43 @@ def test_imports_go_down():
         order, pair = ORDER[""].split(), (importer[0], imported[0])
         if pair[0] == pair[1]:
             if pair[0] not in ORDER or len(importer) < 2 or len(imported) < 2 or importer[1] == "__main__":
-                continue  # the package's own names may come from all of its folders
+                continue  # a package may import public names from all of its folders
             order, pair = ORDER[pair[0]].split(), (importer[1], imported[1])
         if any(name not in order for name in pair) or order.index(pair[1]) > order.index(pair[0]):
             faults.append(f"{found.importer} imports {found.imported}: expected an import down the list {order}")
     assert faults == []
 
 
-def test_no_file_imports_itself_through_others():
-    modules, imports = project()
+def test_imports_have_no_cycles():
+    modules, imports = project_imports()
     graph: dict[str, set[str]] = {name: set() for name in modules}
     for found in imports:
-        lazy = found.importer in ORDER  # a package names its public objects, and imports them at their first use
+        lazy = found.importer in ORDER  # packages import their public objects at first use
         if found.imported in modules and not lazy and found.place != "types":
             graph[found.importer].add(found.imported)
     TopologicalSorter(graph).prepare()  # raises CycleError with the cycle
 
 
-def test_the_reader_works_without_jax():
+def test_reader_does_not_import_jax():
     faults = [
         found
-        for found in project()[1]
+        for found in project_imports()[1]
         if found.importer.startswith("icrl4aht_data.") and found.imported.split(".")[0] in JAX
         if found.place == "top" or (found.place == "function" and found.importer not in JAX_ON_DEMAND)
     ]
     assert faults == []
 
 
-def test_baselines_use_only_what_playing_needs():
+def test_baselines_import_only_allowed_parts_of_generation():
     used = {
         found.imported.split(".")[1]
-        for found in project()[1]
+        for found in project_imports()[1]
         if found.importer.startswith("icrl4aht_baselines") and found.imported.startswith("icrl4aht_generation.")
     }
     assert used <= BASELINES_MAY_USE
 
 
-def test_importing_the_reader_loads_nothing_heavy():
+def test_importing_the_reader_loads_no_heavy_libraries():
     code = "import sys, icrl4aht_data; print(sorted({name.split('.')[0] for name in sys.modules}))"
     loaded = ast.literal_eval(run_python("-c", code))
     assert "numpy" in loaded

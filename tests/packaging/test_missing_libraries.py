@@ -1,4 +1,4 @@
-"""Without an optional library, what needs it is refused before it starts, with the command that installs it."""
+"""Test that a missing optional library is reported before work starts, with the command that installs the library."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from tests.helpers.commands import run_cli, run_python
 QUIET = Console(quiet=True)
 
 
-def adapter(name: str) -> Callable[[Any], object]:
-    """Return an import of an adapter, which other tests may have imported before."""
+def adapter_import(name: str) -> Callable[[Any], object]:
+    """Return a function that imports an adapter again, even if other tests imported the adapter before."""
 
-    def again(dataset: Any) -> object:
+    def import_again(dataset: Any) -> object:
         sys.modules.pop(f"icrl4aht_generation.adapters.{name}", None)
         return importlib.import_module(f"icrl4aht_generation.adapters.{name}")
 
-    return again
+    return import_again
 
 
 USES: list[tuple[str, str, Callable[[Any], object]]] = [
@@ -53,10 +53,10 @@ USES: list[tuple[str, str, Callable[[Any], object]]] = [
         for library in ("matplotlib", "PIL")
     ),
     ("gymnasium", "gym", lambda dataset: make_environment(task={})),
-    ("gymnasium", "gym", adapter("gymnasium_env")),
-    ("pettingzoo", "pettingzoo", adapter("pettingzoo_env")),
-    ("gymnasium", "pettingzoo", adapter("pettingzoo_env")),
-    ("jaxmarl", "jaxmarl", adapter("jaxmarl_env")),
+    ("gymnasium", "gym", adapter_import("gymnasium_env")),
+    ("pettingzoo", "pettingzoo", adapter_import("pettingzoo_env")),
+    ("gymnasium", "pettingzoo", adapter_import("pettingzoo_env")),
+    ("jaxmarl", "jaxmarl", adapter_import("jaxmarl_env")),
     ("uvicorn", "play", lambda dataset: run_cli("play")),
     ("tensorboardX", "tensorboard", lambda dataset: check_loggers(LOGGER_NAMES)),
     ("wandb", "wandb", lambda dataset: check_loggers(["wandb"])),
@@ -66,7 +66,7 @@ USES: list[tuple[str, str, Callable[[Any], object]]] = [
 
 
 @pytest.mark.parametrize(("library", "extra", "use"), USES)
-def test_a_missing_library_names_its_extra(lite, tmp_path, monkeypatch, library, extra, use):
+def test_missing_library_raises_error_with_install_command(lite, tmp_path, monkeypatch, library, extra, use):
     dataset = load_icrl4aht(lite[0], layout="demo_wide")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, library, None)
@@ -93,7 +93,7 @@ for words in sys.argv[1:]:
 """
 
 
-def test_without_jax_commands_explain_themselves_or_name_the_extra(tmp_path):
+def test_commands_without_jax_show_help_or_the_install_command(tmp_path):
     out = f"--out {tmp_path}/out"
     lines = ["train --help", "generate --help", "list"]
     lines += [f"evaluate --agent stay {out}", f"train ad --layout demo_wide {out}", "plan"]

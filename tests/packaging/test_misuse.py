@@ -1,4 +1,4 @@
-"""Bad input on the command lines: an exit code, one message that names it and says what to do, and no traceback."""
+"""Test bad input on the command line: an exit code, one message with fault and remedy, and no traceback."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from tests.helpers.paths import ROOT
 
 
 @pytest.fixture
-def say(capsys, monkeypatch, tmp_path):
-    """Run a program in a folder with an empty folder, a file and a folder with a release: exit code and output."""
+def run_program(capsys, monkeypatch, tmp_path):
+    """Return a function that runs the program in a folder of examples and returns exit code and output."""
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("hi")
     (tmp_path / "outer").mkdir()
@@ -28,7 +28,7 @@ def say(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ICRL4AHT_REMOTE", raising=False)
 
-    def say(*words: str) -> tuple[int, str]:
+    def run_program(*words: str) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["x", *words])
         with pytest.raises(SystemExit) as stop:
             run(cli)
@@ -36,7 +36,7 @@ def say(capsys, monkeypatch, tmp_path):
         assert "Traceback" not in printed.err
         return int(stop.value.code or 0), " ".join((printed.out + printed.err).split())
 
-    return say
+    return run_program
 
 
 MISUSED = """
@@ -94,23 +94,23 @@ evaluate --agent stay --out e --layout cramped_up | no task on cramped_up in
 """
 
 
-def cases(text: str, code: int) -> Iterator[tuple[str, str, int]]:
-    """Arguments, message and exit code of each line."""
+def parse_cases(text: str, code: int) -> Iterator[tuple[str, str, int]]:
+    """Yield arguments, message and exit code of each line."""
     for line in text.strip().splitlines():
         arguments, _, message = line.partition(" | ")
         yield arguments.replace("{MINI}", str(MINI)), message, code
 
 
-@pytest.mark.parametrize(("arguments", "message", "code"), [*cases(MISUSED, 2), *cases(FAILED, 1)])
-def test_bad_input_has_a_message_and_an_exit_code(say, arguments, message, code):
-    found, said = say(*arguments.split())
+@pytest.mark.parametrize(("arguments", "message", "code"), [*parse_cases(MISUSED, 2), *parse_cases(FAILED, 1)])
+def test_bad_input_gives_a_message_and_an_exit_code(run_program, arguments, message, code):
+    found, said = run_program(*arguments.split())
     assert message in said
     assert found == code
 
 
-def test_empty_arguments_are_refused(say):
-    assert say("list", "")[1].endswith("expected a folder, found an empty text")
-    assert say("release", "build", "--out", "")[1].endswith("expected a folder, found an empty text")
+def test_empty_arguments_are_refused(run_program):
+    assert run_program("list", "")[1].endswith("expected a folder, found an empty text")
+    assert run_program("release", "build", "--out", "")[1].endswith("expected a folder, found an empty text")
 
 
 @pytest.mark.parametrize(
@@ -122,26 +122,26 @@ def test_empty_arguments_are_refused(say):
         (errno.EIO, "x.h5", "error: x.h5: Input/output error\n"),
     ],
 )
-def test_disk_errors_name_the_users_file(capsys, monkeypatch, number, name, message):
+def test_disk_errors_name_the_file_of_the_user(capsys, monkeypatch, number, name, message):
     @click.command()
-    def fail() -> None:
+    def failing_command() -> None:
         raise OSError(number, "in other words", name)
 
     monkeypatch.setattr(sys, "argv", ["x"])
     with pytest.raises(SystemExit) as stop:
-        run(fail)
+        run(failing_command)
     assert stop.value.code == 1
     assert capsys.readouterr().err.startswith(message)
 
 
-def test_bugs_are_raised(monkeypatch):
+def test_errors_caused_by_bugs_are_raised(monkeypatch):
     @click.command()
-    def fail() -> None:
+    def failing_command() -> None:
         raise ModuleNotFoundError("No module named 'nowhere'", name="nowhere")
 
     monkeypatch.setattr(sys, "argv", ["x"])
     with pytest.raises(ModuleNotFoundError):
-        run(fail)
+        run(failing_command)
 
 
 def test_unreachable_ray_is_reported():
@@ -152,9 +152,9 @@ def test_unreachable_ray_is_reported():
         pass
 
 
-def test_invalid_data_version_in_a_profile(tmp_path: Path, say):
+def test_invalid_data_version_in_a_profile_is_refused(tmp_path: Path, run_program):
     profile = tmp_path / "mine.toml"
     smoke = (ROOT / "generation" / "icrl4aht_generation" / "profiles" / "smoke.toml").read_text(encoding="utf-8")
     profile.write_text(smoke.replace('data_version = "0.0.1"', 'data_version = "new"'), encoding="utf-8")
-    code, said = say("plan", "--profile", str(profile))
+    code, said = run_program("plan", "--profile", str(profile))
     assert (code, "mine.toml: data version 'new': expected a SemVer version such as 1.0.0" in said) == (1, True)

@@ -1,4 +1,4 @@
-"""Names and docstrings: one public name has one meaning, and a docstring can be read without the one before it."""
+"""Test that public names are unique and that source files are short."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ LONGEST = 500
 """Most lines of a source file, as CONTRIBUTING.md says."""
 
 
-def sources(*names: str) -> Iterator[tuple[str, str]]:
-    """Yield the path in the repository and the text of each source file of some packages."""
+def source_files(*names: str) -> Iterator[tuple[str, str]]:
+    """Yield the repository path and the text of each source file of some packages."""
     for path in sorted(path for name in names for path in PACKAGES[name].rglob("*.py")):
         yield path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
 
 
 def public_names(tree: ast.Module) -> Iterator[str]:
-    """Yield the classes, functions and constants that a module defines, without click's commands and type variables."""
+    """Yield the classes, functions and constants that a module defines, except click commands and type variables."""
     for node in tree.body:
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
             decorators = " ".join(map(ast.unparse, node.decorator_list))
@@ -27,7 +27,7 @@ def public_names(tree: ast.Module) -> Iterator[str]:
         elif isinstance(node, ast.Assign | ast.AnnAssign) and "TypeVar(" not in ast.unparse(node):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             found = [name for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
-            names = [name.id for name in found if isinstance(name.ctx, ast.Store)]  # no names that are only read
+            names = [name.id for name in found if isinstance(name.ctx, ast.Store)]  # only assigned names
         else:
             names = []
         yield from (name for name in names if not name.startswith("_"))
@@ -35,12 +35,12 @@ def public_names(tree: ast.Module) -> Iterator[str]:
 
 def test_public_names_are_unique():
     modules: dict[str, set[str]] = defaultdict(set)
-    for path, text in sources(*(name for name in PACKAGES if name != "tests")):
+    for path, text in source_files(*(name for name in PACKAGES if name != "tests")):
         for name in public_names(ast.parse(text)):
             modules[name].add(path)
     assert {name: paths for name, paths in modules.items() if len(paths) > 1 and name not in ("main", "VERBS")} == {}
 
 
 def test_source_files_are_short():
-    lines = {path: text.count("\n") for path, text in sources(*(name for name in PACKAGES if name != "tests"))}
+    lines = {path: text.count("\n") for path, text in source_files(*(name for name in PACKAGES if name != "tests"))}
     assert {path: count for path, count in lines.items() if count > LONGEST} == {}

@@ -1,4 +1,4 @@
-"""The notebooks of docs/notebooks run without errors, and are stored with outputs that are small."""
+"""Test that the notebooks of docs/notebooks run, and that stored outputs are complete and small."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ SMALLER = {"STEPS = 1200": "STEPS = 50", "episodes=10)": "episodes=2)", "episode
 """Text of notebooks -> text that takes less time."""
 
 
-def test_there_are_notebooks():
+def test_all_expected_notebooks_exist():
     assert {path.stem for path in NOTEBOOKS} == {"explore", "train_ad_pytorch", "own_agent_and_teammate"}
 
 
 @EVERY_NOTEBOOK
-def test_stored_outputs(path):
-    """Every code cell was executed in order, without errors; pictures are there; nothing names this machine."""
+def test_stored_outputs_are_complete_and_small(path):
+    """All code cells ran in order without errors, pictures are stored, and no path of this machine is shown."""
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -36,7 +36,7 @@ def test_stored_outputs(path):
 
 
 @EVERY_NOTEBOOK
-def test_links(path):
+def test_files_linked_from_notebooks_exist(path):
     text = "\n".join(cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "markdown")
     for target in re.findall(r"\]\((.*?)\)", text):
         assert (path.parent / target).is_file(), target
@@ -44,7 +44,7 @@ def test_links(path):
 
 @pytest.mark.slow
 @EVERY_NOTEBOOK
-def test_notebook_runs(path, tmp_path):
+def test_notebook_runs_without_errors(path, tmp_path):
     executed, stored = execute(path, tmp_path, SMALLER), nbformat.read(path, as_version=4)
     assert len(executed.cells) == len(stored.cells)
     assert [bool(cell.get("outputs")) for cell in executed.cells] == [

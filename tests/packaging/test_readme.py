@@ -1,4 +1,4 @@
-"""The README: short, its code prints the shown output, and its commands are valid."""
+"""Test the README: its length, the output of its code, and its commands."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ CHARACTERS = 8000
 """Length limit of the README: the rest is in docs/."""
 
 
-def blocks(language: str, page: str = README) -> list[str]:
+def code_blocks(language: str, page: str = README) -> list[str]:
     """Return the code blocks of a page in one language."""
     return re.findall(rf"```{language}\n(.*?)```", page, flags=re.DOTALL)
 
 
-def commands(page: str = README, program: str = "icrl4aht-data") -> list[list[str]]:
+def shell_calls(page: str = README, program: str = "icrl4aht-data") -> list[list[str]]:
     """Return the arguments of every call of a program in the shell blocks of a page."""
-    lines = [line for block in blocks("sh", page) for line in block.splitlines() if line.startswith(program)]
+    lines = [line for block in code_blocks("sh", page) for line in block.splitlines() if line.startswith(program)]
     return [shlex.split(line, comments=True)[1:] for line in lines]
 
 
-def understand(group: click.Group, arguments: list[str]) -> None:
-    """Check that a program has the command and accepts its arguments, without running it."""
+def check_arguments(group: click.Group, arguments: list[str]) -> None:
+    """Check that a program has a command and accepts the arguments, without running the command."""
     name, command, rest = group.resolve_command(group.make_context("x", ["x"], resilient_parsing=True), arguments)
     assert command is not None
     if isinstance(command, click.Group):
-        understand(command, rest)
+        check_arguments(command, rest)
     else:
         command.make_context(name, rest)
 
 
-def test_it_is_short():
+def test_readme_is_short():
     assert len(README) <= CHARACTERS
 
 
-def test_ten_lines_print_the_shown_output():
-    (code,), (shown,) = blocks("python"), blocks("text")
+def test_code_of_the_readme_prints_the_shown_output():
+    (code,), (shown,) = code_blocks("python"), code_blocks("text")
     assert len([line for line in code.splitlines() if line]) <= 10
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         exec(compile(code, "README.md", "exec"), {})
     assert printed.getvalue() == shown
 
 
-def test_commands_are_accepted():
-    assert commands()
-    for arguments in commands():
-        understand(cli, arguments)
+def test_commands_of_the_readme_are_accepted():
+    assert shell_calls()
+    for arguments in shell_calls():
+        check_arguments(cli, arguments)

@@ -1,4 +1,4 @@
-"""Files that services and tools of the repository read: workflows, issue forms, hooks, constraints, the citation."""
+"""Test files that services and tools read: workflows, issue forms, hooks, constraints and the citation."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SCHEMAS = {
 
 
 def requirements() -> list[Requirement]:
-    """Return the requirements of the package and its extras, without those on itself."""
+    """Return the requirements of the package and all extras, except requirements on the package itself."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     lists = [project["dependencies"], *project["optional-dependencies"].values()]
     found = [Requirement(text) for texts in lists for text in texts]
@@ -34,14 +34,14 @@ def requirements() -> list[Requirement]:
 
 
 @pytest.mark.parametrize("schema", SCHEMAS)
-def test_files_have_their_schema(schema):
+def test_files_match_their_schemas(schema):
     command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", f"vendor.{schema}", *SCHEMAS[schema]]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_workflows_run_targets_that_exist():
-    """Each `make TARGET` is a target of the Makefile, and the matrix has the Python versions of the package."""
+def test_workflows_run_existing_make_targets():
+    """Each `make TARGET` of a workflow, and each benchmark of the matrix, must be a target of the Makefile."""
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     texts = [path.read_text() for path in WORKFLOWS]
     benches = yaml.safe_load(texts[0])["jobs"]["benchmarks"]["strategy"]["matrix"]["bench"]
@@ -50,12 +50,12 @@ def test_workflows_run_targets_that_exist():
     assert called >= {"test-slow", "demo", "check", "docs", "bench-env"} and called <= targets
 
 
-def test_hooks_are_valid():
+def test_pre_commit_hooks_are_valid():
     command = [sys.executable, "-m", "pre_commit", "validate-config", str(ROOT / ".pre-commit-config.yaml")]
     assert subprocess.run(command, check=False).returncode == 0
 
 
-def test_constraints_are_versions_that_the_package_allows():
+def test_constraints_pin_versions_that_the_package_allows():
     lines = [Requirement(line) for line in (ROOT / "constraints.txt").read_text().splitlines()]
     pinned = {canonicalize_name(one.name): str(one.specifier).removeprefix("==") for one in lines}
     for one in requirements():
@@ -66,18 +66,18 @@ def test_constraints_are_versions_that_the_package_allows():
             assert "cuda" in str(one) or name == "distrax", f"{one}: no tested version; run `make constraints`"
 
 
-def test_the_lowest_jax_is_tested():
+def test_workflow_tests_the_lowest_supported_jax():
     (jax,) = (one for one in requirements() if one.name == "jax" and not one.extras)
     lowest = str(jax.specifier).removeprefix(">=")
     assert f"jax=={lowest}.0" in (ROOT / ".github" / "workflows" / "tests.yml").read_text()
 
 
-def test_the_citation_has_the_version():
+def test_citation_has_the_version_of_the_package():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version("icrl4aht-data")
 
 
-def test_the_address_is_the_same_everywhere():
-    """pyproject.toml has the repository's address, once there is one; README, the citation and the site repeat it."""
+def test_repository_address_is_the_same_in_all_files():
+    """README, citation and site must repeat the repository address of pyproject.toml, if pyproject.toml has one."""
     url = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"].get("Repository")
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text()).get("repository-code") == url
     assert re.findall(r"^repo_url: (.*)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE) == ([url] if url else [])

@@ -1,4 +1,4 @@
-"""The documentation as a whole: links, names and messages exist, and the site builds without a warning or a network."""
+"""Test the documentation as a whole: links and names exist, and the site builds without warnings or network."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ import pytest
 
 from tests.helpers.chromium import CHROMIUM, NEEDS_CHROMIUM
 from tests.helpers.paths import ROOT
-from tests.packaging.test_docs import DOCS, PAGES, rows
+from tests.packaging.test_docs import DOCS, PAGES, table_rows
 
 FILES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(DOCS / f"{page}.md" for page in PAGES)]
 TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 EVERY_FILE = pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
 
 
-def anchors(text: str) -> set[str]:
-    """Return the addresses of a page's headings, as code hosts and the site form them."""
+def heading_anchors(text: str) -> set[str]:
+    """Return the anchors that code hosts and the site give to a page's headings."""
     titles = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
 
 
 @EVERY_FILE
-def test_links_exist(path):
+def test_linked_files_and_headings_exist(path):
     for target in re.findall(r"\]\((?!https?://)(.*?)\)", TEXTS[path]):
         name, _, anchor = target.partition("#")
         file = (path.parent / name).resolve() if name else path
         assert file.is_file(), target
         if anchor:
-            assert anchor in anchors(TEXTS[file]), target
+            assert anchor in heading_anchors(TEXTS[file]), target
 
 
 @EVERY_FILE
-def test_make_targets_exist(path):
+def test_make_targets_named_in_pages_exist(path):
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     assert set(re.findall(r"(?:`|^    )make ([a-z-]+)(?![a-z.-])", TEXTS[path], re.MULTILINE)) <= targets
 
@@ -48,7 +48,7 @@ def test_every_page_is_in_the_navigation():
     assert sorted(listed) == sorted(PAGES)
 
 
-def test_the_public_interface_exists():
+def test_names_listed_in_the_api_page_exist():
     listed = re.findall(r"`([\w.]+)`: ((?:`[\w.]+`(?:, )?)+)", PAGES["api/index"])
     assert len(listed) >= 5
     for module, names in listed:
@@ -56,16 +56,16 @@ def test_the_public_interface_exists():
             assert pydoc.locate(f"{module}.{name}") is not None, (module, name)
 
 
-def test_extras_are_listed():
+def test_start_page_lists_all_extras():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    listed = {name for cells in rows("start", "extra") for name in cells[0].split(", ")}
+    listed = {name for cells in table_rows("start", "extra") for name in cells[0].split(", ")}
     assert listed == project["optional-dependencies"].keys() - {"browser", "peers"}
     assert re.search(r"\[.*\bbrowser\b.*\]", project["optional-dependencies"]["dev"][0]), "tests of pages need it"
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
-    """The built site; building fails on warnings."""
+    """Build the site, with warnings as errors, and return its folder."""
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
@@ -87,7 +87,7 @@ def test_the_site_loads_nothing_from_other_hosts(site):
 
 
 @NEEDS_CHROMIUM
-def test_pages_on_a_disk_can_be_searched(site):
+def test_site_opened_from_disk_can_be_searched(site):
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:

@@ -1,6 +1,4 @@
-"""The wheel contains the three packages with their data, and works in an environment with only its dependencies; with
-the extras that its messages name, it trains and evaluates. The source archive contains all that the wheel is made of.
-"""
+"""Test the wheel and the source archive: contents, use with and without extras, and installed size."""
 
 from __future__ import annotations
 
@@ -90,22 +88,22 @@ print("matplotlib" in sys.modules or "PIL" in sys.modules)
 """Evaluates an agent of one's own, without drawing anything."""
 
 
-def call(*command: str | Path, **options) -> subprocess.CompletedProcess:
+def run_isolated(*command: str | Path, **options) -> subprocess.CompletedProcess:
     """Run a command without this environment's Python variables."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     environment |= options.pop("env", {})
     return subprocess.run(list(map(str, command)), capture_output=True, text=True, env=environment, **options)
 
 
-def install(*arguments: str | Path) -> None:
-    """Install with uv if this environment has it, else with pip; skip the test if the registry cannot be reached."""
+def install_packages(*arguments: str | Path) -> None:
+    """Install packages with uv if available, else with pip; skip the test if the registry cannot be reached."""
     uv = Path(sys.executable).with_name("uv")
     python, *rest = arguments
     if uv.exists():
-        done = call(uv, "pip", "install", "--quiet", "--python", python, *rest)
+        done = run_isolated(uv, "pip", "install", "--quiet", "--python", python, *rest)
     else:
         pip = ("-m", "pip", "--python", python, "--disable-pip-version-check")
-        done = call(sys.executable, *pip, "install", "--quiet", "--no-compile", *rest)
+        done = run_isolated(sys.executable, *pip, "install", "--quiet", "--no-compile", *rest)
     if any(sign in done.stderr for sign in UNREACHABLE):
         pytest.skip("the package registry cannot be reached")
     assert done.returncode == 0, done.stderr
@@ -113,16 +111,16 @@ def install(*arguments: str | Path) -> None:
 
 @pytest.fixture(scope="session")
 def backend(tmp_path_factory) -> Path:
-    """A folder with the build requirements."""
+    """Return a folder with the installed build requirements."""
     folder = tmp_path_factory.mktemp("backend")
-    install(sys.executable, "--target", folder, *PROJECT["build-system"]["requires"])
+    install_packages(sys.executable, "--target", folder, *PROJECT["build-system"]["requires"])
     return folder
 
 
-def build(backend: Path, source: Path, target: Path, kind: str) -> Path:
-    """Build the wheel or the source archive of a folder."""
+def build_archive(backend: Path, source: Path, target: Path, kind: str) -> Path:
+    """Build the wheel or the source archive of a folder, and return its path."""
     command = (sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", target)
-    done = call(*command, cwd=source, env={"PYTHONPATH": str(backend)})
+    done = run_isolated(*command, cwd=source, env={"PYTHONPATH": str(backend)})
     assert done.returncode == 0, done.stderr
     (path,) = target.iterdir()
     return path
@@ -130,21 +128,21 @@ def build(backend: Path, source: Path, target: Path, kind: str) -> Path:
 
 @pytest.fixture(scope="session")
 def sdist(backend, tmp_path_factory) -> Path:
-    """The source archive, unpacked."""
+    """Return the folder of the unpacked source archive."""
     folder = tmp_path_factory.mktemp("sdist")
-    with tarfile.open(build(backend, ROOT, folder / "packed", "sdist")) as archive:
+    with tarfile.open(build_archive(backend, ROOT, folder / "packed", "sdist")) as archive:
         archive.extractall(folder, filter="data")
     return folder / f"{READER}-{VERSION}"
 
 
 @pytest.fixture(scope="session")
 def wheel(backend, sdist, tmp_path_factory) -> Path:
-    """The wheel, built from the source archive as for publication."""
-    return build(backend, sdist, tmp_path_factory.mktemp("wheel"), "wheel")
+    """Return the wheel, built from the source archive as for publication."""
+    return build_archive(backend, sdist, tmp_path_factory.mktemp("wheel"), "wheel")
 
 
 def files_below(folder: Path) -> set[str]:
-    """Return the relative paths of all files that are not hidden or caches."""
+    """Return the relative paths of all files except hidden files and caches."""
     paths = (path for path in folder.rglob("*") if path.is_file())
     names = {path.relative_to(folder).as_posix() for path in paths}
     return {name for name in names if not any(part.startswith((".", "__pycache__")) for part in Path(name).parts)}
@@ -178,22 +176,22 @@ def test_the_source_archive_is_complete(sdist):
 
 
 def find_python(version: str) -> str | None:
-    """Return the path of a Python of this version that runs: this one, or one on the PATH."""
+    """Return the path of a working Python of this version, running or on the PATH; None if there is none."""
     if sys.version.startswith(f"{version}."):
         return sys.executable
     found = shutil.which(f"python{version}")
-    return found if found and call(found, "--version").returncode == 0 else None
+    return found if found and run_isolated(found, "--version").returncode == 0 else None
 
 
 def make_environment(python: str, folder: Path, *packages: str | Path) -> Path:
-    """Make an environment with only these packages and their dependencies. Returns the folder of its commands."""
-    made = call(python, "-m", "venv", "--without-pip", folder)
+    """Create an environment with only these packages and their dependencies; return the folder of its commands."""
+    made = run_isolated(python, "-m", "venv", "--without-pip", folder)
     assert made.returncode == 0, made.stderr
-    install(folder / "bin" / "python", *packages)
+    install_packages(folder / "bin" / "python", *packages)
     return folder / "bin"
 
 
-def interpreter(version: str) -> str:
+def python_or_skip(version: str) -> str:
     """Return the path of a Python of this version, or skip the test."""
     python = find_python(version)
     if python is None:
@@ -203,26 +201,26 @@ def interpreter(version: str) -> str:
 
 
 @pytest.fixture(scope="module", params=PYTHONS)
-def installed(request, wheel, tmp_path_factory) -> Path:
-    """The folder with the commands of an environment with only the wheel and its dependencies."""
-    return make_environment(interpreter(request.param), tmp_path_factory.mktemp(f"python{request.param}"), wheel)
+def bare_environment(request, wheel, tmp_path_factory) -> Path:
+    """Return the folder of commands of an environment with only the wheel and its dependencies."""
+    return make_environment(python_or_skip(request.param), tmp_path_factory.mktemp(f"python{request.param}"), wheel)
 
 
 @pytest.fixture(scope="module", params=PYTHONS)
-def grown(request, wheel, tmp_path_factory) -> Path:
-    """The folder with the commands of an environment with the extra `jax`, to which tests add others."""
+def jax_environment(request, wheel, tmp_path_factory) -> Path:
+    """Return the folder of commands of an environment with the extra `jax`; tests may add other extras."""
     folder = tmp_path_factory.mktemp(f"grown{request.param}")
-    return make_environment(interpreter(request.param), folder, f"{NAME}[jax] @ {wheel.as_uri()}")
+    return make_environment(python_or_skip(request.param), folder, f"{NAME}[jax] @ {wheel.as_uri()}")
 
 
 Run = Callable[..., str]
 
 
-def runner(commands: Path, folder: Path) -> Run:
+def command_runner(commands: Path, folder: Path) -> Run:
     """Return a function that runs a command of an environment, checks its exit code and returns its output."""
 
     def run(*command: str | Path, code: int = 0, **env: str) -> str:
-        done = call(commands / command[0], *command[1:], cwd=folder, env={"HOME": str(folder), **env})
+        done = run_isolated(commands / command[0], *command[1:], cwd=folder, env={"HOME": str(folder), **env})
         assert done.returncode == code, done.stdout + done.stderr
         assert "Traceback" not in done.stderr
         return done.stdout + done.stderr
@@ -230,27 +228,27 @@ def runner(commands: Path, folder: Path) -> Run:
     return run
 
 
-def hinted(*extras: str) -> str:
-    """Return the command that messages name."""
+def install_hint(*extras: str) -> str:
+    """Return the install command that messages show for some extras."""
     return f"pip install '{NAME}[{','.join(extras)}]'"
 
 
-def follow(hint: str, commands: Path) -> None:
-    """Run the command that a message ends with, in an environment."""
+def run_hint(hint: str, commands: Path) -> None:
+    """In an environment, run the install command at the end of a message."""
     found = re.search(r"pip install (.*)$", hint)
     assert found, hint
-    install(commands / "python", *shlex.split(found[1]))
+    install_packages(commands / "python", *shlex.split(found[1]))
 
 
-def test_the_reader_works_without_extras(installed, wheel, tmp_path):
-    run = runner(installed, tmp_path)
+def test_the_reader_works_without_extras(bare_environment, wheel, tmp_path):
+    run = command_runner(bare_environment, tmp_path)
     used, here = json.loads(run("python", "-c", USE)), load_icrl4aht(split="train", layout="coord_simple")
     assert used["histories"] == read_info(MINI).histories
     assert used["ok"] and used["heavy"] == []
     assert used["return"] == here[0].returns()[-1]
     batch = here.ad(batch_size=2, length=50, seed=0)[0]
     assert used["ad"][0] == list(batch.obs.shape)
-    assert used == json.loads(call(sys.executable, "-c", USE, cwd=ROOT).stdout), "the same batches everywhere"
+    assert used == json.loads(run_isolated(sys.executable, "-c", USE, cwd=ROOT).stdout), "the same batches everywhere"
 
     assert run("icrl4aht-data", "--version") == f"{NAME} {VERSION}\n"
     assert run("python", "-c", f"import {READER}; print({READER}.__version__)") == f"{VERSION}\n"
@@ -261,24 +259,24 @@ def test_the_reader_works_without_extras(installed, wheel, tmp_path):
     assert "jax" not in report.partition("Devices")[2]
     assert re.search(r"jax: not installed: .*baselines", report)
     for extra in ("baselines", "plot", "hf", "s3"):
-        assert f": not installed: {hinted(extra)}\n" in report
-    assert run("icrl4aht-data", "show", "--plot", "curves.png", code=1).endswith(f": {hinted('plot')}\n")
+        assert f": not installed: {install_hint(extra)}\n" in report
+    assert run("icrl4aht-data", "show", "--plot", "curves.png", code=1).endswith(f": {install_hint('plot')}\n")
     assert not list(tmp_path.glob("*.png"))
 
 
-def test_folders_of_a_lab_do_not_hide_ours(installed, tmp_path):
-    """A lab's own packages `baselines` and `generation` are imported where they are found first; ours stay usable."""
+def test_user_packages_with_equal_folder_names_do_not_break_commands(bare_environment, tmp_path):
+    """A user's packages `baselines` and `generation` can be imported, and the command line still works."""
     for name in ("baselines", "generation"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("mine = True\n")
-    run = runner(installed, tmp_path)
+    run = command_runner(bare_environment, tmp_path)
     run("python", "-c", "import baselines, generation; assert baselines.mine and generation.mine")
     assert "evaluate" in run("python", "-m", "icrl4aht_data", "--help")
 
 
-def test_named_extras_train_evaluate_and_draw(grown, wheel, tmp_path):
-    """With `jax` alone, models train and agents play, and nothing is drawn; the command that is named then helps."""
-    run = runner(grown, tmp_path)
+def test_extras_named_in_messages_allow_training_and_drawing(jax_environment, wheel, tmp_path):
+    """With only `jax`, models train and evaluate without drawing; the install command of the message adds drawing."""
+    run = command_runner(jax_environment, tmp_path)
     run("python", "-c", "import jax, flax, optax, importlib.util as u; assert not u.find_spec('matplotlib')")
     assert run("python", "-c", EVALUATE).endswith("\nFalse\n")
     assert "ad-reference" in run("icrl4aht-data", "models")
@@ -287,22 +285,22 @@ def test_named_extras_train_evaluate_and_draw(grown, wheel, tmp_path):
     run("icrl4aht-data", "evaluate", "--agent", "ad-reference", *small, "--out", "results")
     settings = ("--layout", "demo_wide", "--steps", "2", "--batch-size", "2", "--context", "20")
     trained = run("icrl4aht-data", "train", "ad", *settings, "--out", "run")
-    assert f"curves.png was not drawn, matplotlib is not installed: {hinted('plot')}" in trained
+    assert f"curves.png was not drawn, matplotlib is not installed: {install_hint('plot')}" in trained
     assert not list(tmp_path.rglob("*.png"))
     generate = ("icrl4aht-data", "generate", "--profile", "smoke", "--out", "rebuilt")
     assert "pip install" in run(*generate, code=1)
     assert not (tmp_path / "rebuilt").exists()
 
-    follow(hinted("baselines"), grown)
+    run_hint(install_hint("baselines"), jax_environment)
     run("icrl4aht-data", "report", "results")
     assert "demo_wide" in (tmp_path / "results" / "report" / "report.md").read_text(encoding="utf-8")
     assert (tmp_path / "results" / "report" / "report.csv").stat().st_size > 500
 
 
-def test_the_installed_size_is_limited(installed, capsys):
-    (site,) = installed.parent.glob("lib/python*/site-packages")
+def test_the_installed_size_is_limited(bare_environment, capsys):
+    (site,) = bare_environment.parent.glob("lib/python*/site-packages")
     files = (path for path in site.rglob("*") if path.is_file())
-    # Python adds bytecode when a test imports the package: which of it is there depends on the tests that ran before.
+    # Bytecode is not counted, because its size depends on the tests that imported the package before.
     sizes = {path: path.stat().st_size for path in files if path.suffix != ".pyc"}
     own = sum(size for path, size in sizes.items() if path.relative_to(site).parts[0].startswith(tuple(PACKAGES)))
     with capsys.disabled():

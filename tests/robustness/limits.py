@@ -1,4 +1,4 @@
-"""Limits on a process or folder: seconds, memory, file size, disk size, permissions."""
+"""Context managers that limit time, memory, file size, disk size or permissions."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ PAGE = 4096
 
 
 class HungError(Exception):
-    """A block ran into its time limit. No OSError, which the code under test may handle."""
+    """A block exceeded its time limit; not an OSError, which the tested code may handle."""
 
 
 @contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
-    """Raise HungError in a block that takes longer."""
+    """Raise HungError if a block takes longer than `seconds`."""
 
-    def stop(*_: Any) -> None:
+    def raise_hung_error(*_: Any) -> None:
         raise HungError(f"not done after {seconds} s")
 
-    handler = signal.signal(signal.SIGALRM, stop)
+    handler = signal.signal(signal.SIGALRM, raise_hung_error)
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
@@ -49,25 +49,25 @@ def _resource_limit(kind: int, value: int) -> Iterator[Callable[[], None]]:
 
 
 def memory_limit(size: int) -> AbstractContextManager[object]:
-    """Let allocations fail that take more than `size` bytes of address space in addition to what is in use."""
+    """Make allocations fail that need more than `size` bytes beyond the address space in use."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     return _resource_limit(resource.RLIMIT_AS, used + size)
 
 
 def file_size_limit(size: int) -> AbstractContextManager[Callable[[], None]]:
-    """Let writes fail behind `size` bytes of a file, as with a quota; yields a function that removes the limit."""
+    """Make writes fail beyond `size` bytes of a file, like a quota; yield a function that removes the limit."""
     return _resource_limit(resource.RLIMIT_FSIZE, size)
 
 
 @contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[Callable[[], None]]:
-    """Mount a disk of `size` bytes at a folder; yields a function that makes it large."""
+    """Mount a disk of `size` bytes at a folder; yield a function that enlarges the disk."""
     folder.mkdir(parents=True, exist_ok=True)
     _mount(folder, f"size={size}")
     try:
         yield lambda: _mount(folder, "remount,size=64m")
     finally:
-        subprocess.run(["umount", "--lazy", folder], check=True)  # files of it may still be mapped
+        subprocess.run(["umount", "--lazy", folder], check=True)  # files on this disk may still be mapped
 
 
 def _mount(folder: Path, options: str) -> None:
@@ -84,19 +84,19 @@ def can_mount() -> bool:
         return False
 
 
-_CAPABILITIES = 1 << 1 | 1 << 2  # to ignore permissions of files, and of files that are only read
-_VERSION = 0x20080522  # of the structures of capget and capset
+_CAPABILITIES = 1 << 1 | 1 << 2  # CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH, which ignore file permissions
+_VERSION = 0x20080522  # version of the structures of capget and capset
 
 
 @contextmanager
-def permissions_count() -> Iterator[None]:
-    """Let permissions of files hold for this thread, although it may be root's."""
+def enforced_permissions() -> Iterator[None]:
+    """Enforce file permissions in this thread, even for root."""
     libc = ctypes.CDLL(None, use_errno=True)
     header, before, reduced = (ctypes.c_uint32 * 2)(_VERSION, 0), (ctypes.c_uint32 * 6)(), (ctypes.c_uint32 * 6)()
     if libc.capget(header, before):
         raise OSError(ctypes.get_errno(), "capget")
     reduced[:] = list(before)
-    reduced[0] &= ~_CAPABILITIES  # effective, permitted and inheritable ones; then the higher halves
+    reduced[0] &= ~_CAPABILITIES  # index 0 is the lower half of the effective capabilities
     if libc.capset(header, reduced):
         raise OSError(ctypes.get_errno(), "capset")
     try:

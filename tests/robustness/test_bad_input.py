@@ -1,4 +1,4 @@
-"""Damaged files and wrong options raise an error class of their own, never a raw error of another library."""
+"""Test that damaged files and wrong options raise package errors, never errors of other libraries."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from tests.helpers.random_releases import SHARD
 from tests.helpers.spoiled import spoil
 
 
-def load(root, **options):
-    """Open a release as somebody might who wrote it and its manifest with such faults."""
+def load_damaged(root, **options):
+    """Update the manifest of a damaged release, then open the release."""
     write_manifest(root)
     return load_icrl4aht(root, **options)
 
 
 def read_all(root):
-    """Read every field of every history of the damaged layout."""
-    for history in load(root, layout="coord_simple"):
+    """Read every field of every history on the damaged layout."""
+    for history in load_damaged(root, layout="coord_simple"):
         for name in ("state", "actions", "rewards", "dones", "teammate_actions", "expert_actions", "episode_end_state"):
             history.read(name)
 
@@ -45,27 +45,27 @@ def read_all(root):
         (3, FormatTooOldError, "fetch a newer version of the release"),
     ],
 )
-def test_other_format_versions(damaged, version, error, what_to_do):
+def test_unsupported_format_versions_raise_errors(damaged, version, error, what_to_do):
     (damaged / "meta" / "info.json").write_text(json.dumps({"format_version": version, "renamed": 1}))
     with pytest.raises(error, match=rf"info\.json: format version {version}, this package reads 4, 5.*{what_to_do}"):
-        load(damaged)
+        load_damaged(damaged)
 
 
 @pytest.mark.parametrize(
     "content",
     ["", "[]", "{}", '{"format_version": "x"}', '{"format_version": 4}', "\x00", "[" * 9999],
 )
-def test_malformed_info(damaged, content):
+def test_malformed_info_raises_index_format_error(damaged, content):
     (damaged / "meta" / "info.json").write_text(content)
     with pytest.raises(IndexFormatError, match=r"info\.json: malformed"):
-        load(damaged)
+        load_damaged(damaged)
 
 
-def put(**changes):
+def set_fields(**changes):
     return lambda line: json.dumps(json.loads(line) | changes)
 
 
-def drop(name):
+def remove_field(name):
     return lambda line: json.dumps({k: v for k, v in json.loads(line).items() if k != name})
 
 
@@ -73,48 +73,48 @@ def drop(name):
     ("change", "message"),
     [
         (lambda line: line[:40], "Input data was truncated"),
-        (drop("layout"), "missing required field `layout`"),
-        (put(colour="red"), "unknown field `colour`"),
-        (put(T="many"), r"Expected `int`, got `str` - at `\$\.T`"),
-        (put(T=-5), r"Expected `int` >= 1 - at `\$\.T`"),
-        (put(history_id=0), "expected history_id 2, since ids count up from 0, found 0"),
-        (put(layout="cave"), "unknown layout of the train split of track teammate 'cave'"),
-        (put(obs_shape=[5, 5, 41]), r"expected obs_shape \[5, 5, 40\] for .*, found \[5, 5, 41\]"),
-        (put(shard="../../etc/passwd"), "expected data/teammate/coord_simple/train-NNNNN"),
+        (remove_field("layout"), "missing required field `layout`"),
+        (set_fields(colour="red"), "unknown field `colour`"),
+        (set_fields(T="many"), r"Expected `int`, got `str` - at `\$\.T`"),
+        (set_fields(T=-5), r"Expected `int` >= 1 - at `\$\.T`"),
+        (set_fields(history_id=0), "expected history_id 2, since ids count up from 0, found 0"),
+        (set_fields(layout="cave"), "unknown layout of the train split of track teammate 'cave'"),
+        (set_fields(obs_shape=[5, 5, 41]), r"expected obs_shape \[5, 5, 40\] for .*, found \[5, 5, 41\]"),
+        (set_fields(shard="../../etc/passwd"), "expected data/teammate/coord_simple/train-NNNNN"),
     ],
 )
-def test_malformed_index_lines_are_named(damaged, change, message):
+def test_error_names_the_malformed_index_line(damaged, change, message):
     path = damaged / "meta" / "histories.jsonl"
     lines = path.read_text().splitlines()
     lines[2] = change(lines[2])
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(IndexFormatError, match=rf"histories\.jsonl, line 3: .*({message})"):
-        load(damaged)
+        load_damaged(damaged)
 
 
-def test_a_missing_index_line(damaged):
+def test_missing_index_line_raises_error(damaged):
     path = damaged / "meta" / "histories.jsonl"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
     with pytest.raises(IndexFormatError, match=r"11 lines, but .* counts 12 histories"):
-        load(damaged)
+        load_damaged(damaged)
 
 
-def test_missing_shard(damaged):
+def test_missing_shard_raises_error_with_its_name(damaged):
     (damaged / SHARD).unlink()
-    assert len(load(damaged)) == 12, "opening reads the index only"
+    assert len(load_damaged(damaged)) == 12, "opening reads the index only"
     with pytest.raises(ShardMissingError, match=r"train-00000-of-00001\.h5: the index names this shard"):
         read_all(damaged)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
-def test_truncated_shard(damaged, share):
+def test_truncated_shard_raises_error(damaged, share):
     path = damaged / SHARD
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
     with pytest.raises(ShardTruncatedError, match=r"truncated: has \d+ bytes, but chunk \d+ of \w+ in history \d+"):
         read_all(damaged)
 
 
-def test_index_and_shard_disagree(damaged):
+def test_index_that_disagrees_with_a_shard_raises_error(damaged):
     right = (damaged / HISTORIES).read_text()
     for change in ({"T": 119}, {"episodes": 7}, {"has_expert_actions": False}):
         spoil(damaged, HISTORIES, lambda lines, change=change: lines[0].update(change))
@@ -123,7 +123,7 @@ def test_index_and_shard_disagree(damaged):
         (damaged / HISTORIES).write_text(right)
 
 
-def test_chunk_table_faults(damaged):
+def test_damaged_chunk_table_raises_error(damaged):
     path = damaged / chunk_table_name(SHARD)
     table = np.load(path)
     np.save(path, table[1:])
@@ -140,7 +140,7 @@ def test_chunk_table_faults(damaged):
         read_all(damaged)
 
 
-def test_all_errors_have_one_base():
+def test_all_error_classes_have_a_common_base():
     classes = [c for c in vars(errors).values() if isinstance(c, type) and c.__module__ == errors.__name__]
     assert len(classes) > 10
     assert all(issubclass(c, (Icrl4ahtError, Warning)) for c in classes)

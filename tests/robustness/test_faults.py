@@ -1,4 +1,4 @@
-"""Disks, processes and files fail: reading gives the right data or one of our errors, and a second call succeeds."""
+"""Test faults of disks, processes and files: reads return correct data or package errors, and retries succeed."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def digest(arrays: Iterable[np.ndarray]) -> bytes:
 
 
 def hash_batches(dataset: Dataset) -> bytes:
-    """Return a hash of batches of both kinds, from all episodes and from some."""
+    """Return a hash of AD and DPT batches, drawn from all episodes and from a range of episodes."""
     samplers = []
     for part in (dataset.filter(layout=layout.name) for layout in dataset.layouts):
         samplers.append(part.ad(batch_size=8, length=20, teammate_actions=True))
@@ -57,27 +57,27 @@ def hash_batches(dataset: Dataset) -> bytes:
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
-    """A release of some hundred kilobytes, its shards of many pieces."""
+    """Return a release of several hundred kilobytes with many chunks in each shard."""
     root = tmp_path_factory.mktemp("faults") / "release"
     random_release(root, "full", teammates=1, streams=3, episodes=80, length=25)
     return root
 
 
 @pytest.fixture(scope="module")
-def batches(release) -> bytes:
+def batches_hash(release) -> bytes:
     return hash_batches(load_icrl4aht(release, obs="uint8", cache="ram"))
 
 
 @pytest.fixture
-def caches(tmp_path, monkeypatch) -> Path:
-    """An empty cache folder."""
+def cache_folder(tmp_path, monkeypatch) -> Path:
+    """Set the cache and data folders to new paths, and return the cache folder."""
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     return tmp_path / "cache"
 
 
 class DamagedCopy:
-    """A copy of a small release, and what reading it gave before it was damaged."""
+    """Small release that tests damage, with the data that reading returned before any damage."""
 
     def __init__(self, root: Path) -> None:
         random_release(root, teammates=2, streams=1, episodes=6, length=15)
@@ -94,7 +94,7 @@ class DamagedCopy:
 
     @contextmanager
     def damaged(self, path: Path, data: bytes) -> Iterator[None]:
-        """Replace the content of a file for a while, not its times."""
+        """Replace the content of a file during a block, but keep its timestamps."""
         right, status = path.read_bytes(), path.stat()
         path.write_bytes(data)
         os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
@@ -104,36 +104,36 @@ class DamagedCopy:
             path.write_bytes(right)
 
     def check(self, cache: CacheMode = "ram") -> None:
-        """Assert that `verify` finds the damage, and that reading raises one of our errors or gives the right data."""
+        """Assert that `verify` finds the damage, and that reading returns correct data or raises a package error."""
         assert not verify_release(self.root).ok, "verify finds nothing"
         with suppress(Icrl4ahtError):
             assert self.read(self.root, cache) == self.before, "other data without an error"
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory) -> DamagedCopy:
+def small_release(tmp_path_factory) -> DamagedCopy:
     return DamagedCopy(tmp_path_factory.mktemp("small") / "release")
 
 
 @pytest.mark.parametrize("count", [9, pytest.param(90, marks=SLOW)])
-def test_no_reading_believes_a_flipped_bit(small, caches, count):
-    """Every file of the release has its turn, and every cache mode. test_verify.py flips hundreds of bits."""
-    rng, paths = np.random.default_rng(1), sorted(path for path in small.root.rglob("*") if path.is_file())
+def test_flipped_bit_never_changes_the_data_that_is_read(small_release, cache_folder, count):
+    """Damage all files in turn and read in all cache modes; test_verify.py flips hundreds of bits."""
+    rng, paths = np.random.default_rng(1), sorted(path for path in small_release.root.rglob("*") if path.is_file())
     modes: list[CacheMode] = ["ram", "stream", "mmap"]
     for number in range(count):
         path = paths[number % len(paths)]
         data = bytearray(path.read_bytes())
         data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
-        with small.damaged(path, bytes(data)):
-            small.check(modes[number % 3])
+        with small_release.damaged(path, bytes(data)):
+            small_release.check(modes[number % 3])
 
 
 VALUES = [0, -1, 2**31, 2**63, 10**400, 1e300, -0.5, None, True, "", "x", "\0", "../x", "/etc", "ü" * 9, [], [[]], {}]
 RAW = [b"NaN", b"1e999", b"[" * 100_000, b'{"a":' * 50_000, b'"' + b"x" * 10_000_000 + b'"', b"\xff\xfe", b"\\ud800"]
 
 
-def mutated(data: bytes, rng: np.random.Generator) -> bytes:
-    """Return `data` without a part, with other bytes in it, or with another value of its JSON."""
+def mutate(data: bytes, rng: np.random.Generator) -> bytes:
+    """Return `data` with a part removed, with other bytes, or with another JSON value."""
     low, high = sorted(rng.integers(len(data) + 1, size=2).tolist())
     found = list(re.finditer(rb'(?<=[:\[,] )(?:"[^"]*"|-?[\d.]+|true|false|null)', data)) or [re.match(b"", data)]
     value = found[rng.integers(len(found))]
@@ -150,29 +150,29 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
 
 @pytest.mark.parametrize("name", [HISTORIES, INFO, MANIFEST, TASKS, PROVENANCE])
 @pytest.mark.parametrize("count", [1, pytest.param(10, marks=SLOW)])
-def test_mutated_text_files(small, caches, tmp_path, name, count):
-    """The errors are ours, also where the manifest fits the mutated file; time and memory are bounded."""
-    path, rng = small.root / name, np.random.default_rng(count)
+def test_mutated_text_files_raise_only_package_errors(small_release, cache_folder, tmp_path, name, count):
+    """Read each mutated file with the old manifest, then with a matching manifest."""
+    path, rng = small_release.root / name, np.random.default_rng(count)
     for number in range(count):
         data = mutant = path.read_bytes()
         while mutant == data:
-            mutant = mutated(data, rng)
-        with small.damaged(path, mutant), time_limit(20), memory_limit(2 * 2**30):
+            mutant = mutate(data, rng)
+        with small_release.damaged(path, mutant), time_limit(20), memory_limit(2 * 2**30):
             if name == MANIFEST:
-                with http_server(small.root) as server, suppress(Icrl4ahtError):
+                with http_server(small_release.root) as server, suppress(Icrl4ahtError):
                     fetch_planned(plan_download(server.url, to=tmp_path / f"{number}"))
-                    assert small.read(tmp_path / f"{number}") == small.before, "other data, downloaded"
+                    assert small_release.read(tmp_path / f"{number}") == small_release.before, "other data, downloaded"
                 continue
-            small.check()
-            with small.damaged(small.root / MANIFEST, (small.root / MANIFEST).read_bytes()):
-                write_manifest(small.root)
-                verify_release(small.root)
+            small_release.check()
+            with small_release.damaged(small_release.root / MANIFEST, (small_release.root / MANIFEST).read_bytes()):
+                write_manifest(small_release.root)
+                verify_release(small_release.root)
                 with suppress(Icrl4ahtError):
-                    small.read(small.root)
+                    small_release.read(small_release.root)
 
 
-def limited(folder: Path, size: int, mounted: bool):
-    """Limit the bytes of a folder if `mounted`, else of each file."""
+def limit_space(folder: Path, size: int, mounted: bool):
+    """Limit the total bytes of a folder if `mounted`, else the bytes of each file."""
     return small_disk(folder, size) if mounted else file_size_limit(size)
 
 
@@ -187,7 +187,7 @@ def test_a_download_that_fills_the_disk_is_resumed(release, tmp_path, share, mou
     right, to = contents(release), tmp_path / "disk" / "release"
     sizes = [len(data) for data in right.values()]
     size = int(share * (sum(sizes) if mounted else max(sizes))) // PAGE * PAGE
-    with http_server(release) as server, limited(to.parent, size, mounted) as enlarge:
+    with http_server(release) as server, limit_space(to.parent, size, mounted) as enlarge:
         with pytest.raises((Icrl4ahtError, OSError)) as caught:
             fetch_planned(plan_download(server.url, to=to))
         error = caught.value
@@ -200,15 +200,15 @@ def test_a_download_that_fills_the_disk_is_resumed(release, tmp_path, share, mou
 
 @DISKS
 @pytest.mark.parametrize("size", [PAGE, 8 * PAGE])
-def test_mapped_arrays_that_fill_the_disk(release, batches, caches, size, mounted):
-    with limited(caches, size, mounted) as enlarge:
+def test_cache_on_a_full_disk_raises_error_and_can_be_rebuilt(release, batches_hash, cache_folder, size, mounted):
+    with limit_space(cache_folder, size, mounted) as enlarge:
         dataset = load_icrl4aht(release, obs="uint8", cache="mmap")
-        with pytest.raises(CacheError, match=f"{caches}: the cache folder has no room for arrays of "):
+        with pytest.raises(CacheError, match=f"{cache_folder}: the cache folder has no room for arrays of "):
             hash_batches(dataset)
-        left = [path.name for path in caches.iterdir()]
+        left = [path.name for path in cache_folder.iterdir()]
         assert all(name.startswith("histories-") for name in left), left
         enlarge()
-        assert hash_batches(dataset) == batches
+        assert hash_batches(dataset) == batches_hash
 
 
 CODE = {
@@ -219,8 +219,8 @@ CODE = {
 """What processes do with a release or its address."""
 
 
-def start(code: str, *arguments: object) -> subprocess.Popen[str]:
-    """Start a Python process that runs `code` when a line comes in; return when it is ready."""
+def start_process(code: str, *arguments: object) -> subprocess.Popen[str]:
+    """Start a Python process that runs `code` after a line on stdin; return when the process is ready."""
     imports = """
 import sys
 from pathlib import Path
@@ -238,12 +238,12 @@ sys.stdin.readline()
 
 
 @pytest.mark.parametrize("what", ["download", pytest.param("open", marks=SLOW), pytest.param("build", marks=SLOW)])
-def test_two_processes_at_once(release, batches, caches, tmp_path, what):
+def test_two_processes_can_share_a_download_or_cache(release, batches_hash, cache_folder, tmp_path, what):
     to = tmp_path / "copy"
     with http_server(release) as server:
         server.faults.next(Slow(0.01), times=10**9)
         root = release if what == "build" else server.url
-        processes = [start(CODE[what], root, to) for _ in range(2)]
+        processes = [start_process(CODE[what], root, to) for _ in range(2)]
         for process in processes:
             assert process.stdin is not None
             process.stdin.write("\n")
@@ -253,16 +253,16 @@ def test_two_processes_at_once(release, batches, caches, tmp_path, what):
     if what == "download":
         assert contents(to) == contents(release)
     if what == "build":
-        assert {path.name.split("-")[0] for path in caches.iterdir()} <= {"histories"}
-        made = contents(caches)
-        assert hash_batches(load_icrl4aht(release, obs="uint8", cache="mmap")) == batches
-        assert contents(caches) == made, "built again"
+        assert {path.name.split("-")[0] for path in cache_folder.iterdir()} <= {"histories"}
+        made = contents(cache_folder)
+        assert hash_batches(load_icrl4aht(release, obs="uint8", cache="mmap")) == batches_hash
+        assert contents(cache_folder) == made, "built again"
 
 
 @SLOW
 @pytest.mark.parametrize("moment", [0.02, 0.1, 0.3])
-def test_what_a_killed_process_left_is_used_or_replaced(release, batches, caches, moment):
-    process = start(CODE["build"] + "\nsys.stdin.readline()", release)
+def test_cache_of_a_killed_process_is_completed_or_replaced(release, batches_hash, cache_folder, moment):
+    process = start_process(CODE["build"] + "\nsys.stdin.readline()", release)
     assert process.stdin is not None
     process.stdin.write("\n")
     process.stdin.flush()
@@ -270,14 +270,14 @@ def test_what_a_killed_process_left_is_used_or_replaced(release, batches, caches
     process.kill()
     assert process.wait() == -signal.SIGKILL
     process.communicate()
-    for _ in range(2):  # the first builds what is missing, the second finds it
-        assert hash_batches(load_icrl4aht(release, obs="uint8", cache="mmap")) == batches
+    for _ in range(2):  # the first call builds missing arrays, the second call reuses them
+        assert hash_batches(load_icrl4aht(release, obs="uint8", cache="mmap")) == batches_hash
 
 
-def test_episodes_one_step_shorter_by_a_flipped_bit(small, tmp_path):
-    """15 steps become 14 by one bit, and 90 steps are six complete episodes of either length."""
+def test_changed_episode_length_in_info_raises_errors(small_release, tmp_path):
+    """One flipped bit changes the steps of an episode in info.json from 15 to 14."""
     root = tmp_path / "release"
-    shutil.copytree(small.root, root)
+    shutil.copytree(small_release.root, root)
     info = root / "meta" / "info.json"
     info.write_text(info.read_text().replace('"kept_steps": 15', '"kept_steps": 14'))
     with pytest.raises(IndexFormatError, match=r"info\.json: expected sha256"):
@@ -288,13 +288,13 @@ def test_episodes_one_step_shorter_by_a_flipped_bit(small, tmp_path):
         dataset.ad(batch_size=4, length=5, episodes=(1, 4))
 
 
-def test_a_manifest_without_its_last_byte_is_cut_off(small):
-    text = (small.root / "MANIFEST.sha256").read_text()
+def test_manifest_without_its_last_byte_is_refused(small_release):
+    text = (small_release.root / "MANIFEST.sha256").read_text()
     with pytest.raises(IndexFormatError, match=r"MANIFEST is cut off: the last line does not end"):
         parse_manifest(text[:-1], "MANIFEST")
 
 
-def test_an_error_of_the_disk_names_the_file(tmp_path):
+def test_disk_error_names_the_file(tmp_path):
     path = tmp_path / "notes.json"
     with pytest.raises(OSError, match=r"notes\.json") as caught, file_size_limit(100), atomic_write(path) as partial:
         partial.write_bytes(bytes(200))

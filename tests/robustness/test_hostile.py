@@ -1,6 +1,6 @@
-"""Hostile releases, published files and servers end in one of our errors or a finding that names the fault.
+"""Test that hostile releases, published files and servers cause package errors or findings that name the fault.
 
-They run in one process of their own, whose memory is bounded: see `hostile.run`.
+All cases run in one separate process with bounded memory, see `hostile.run`.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ DISK_BYTES = 64 * 2**20
 
 
 @pytest.fixture(scope="module")
-def outcome_of(tmp_path_factory) -> Iterator[Callable[[str], dict[str, Any]]]:
-    """A function that runs the case of a name in the bounded process; one that ends the process is an error."""
+def run_hostile_case(tmp_path_factory) -> Iterator[Callable[[str], dict[str, Any]]]:
+    """Yield a function that runs the case of a given name in a process with bounded memory."""
     folder = tmp_path_factory.mktemp("hostile")
     make_bases(folder)
     context = multiprocessing.get_context("spawn")
@@ -49,8 +49,8 @@ def outcome_of(tmp_path_factory) -> Iterator[Callable[[str], dict[str, Any]]]:
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if n % 8 == 0 else pytest.mark.slow) for n, name in enumerate(CASES)]
 )
-def test_case(outcome_of, name):
-    found = outcome_of(name)
+def test_hostile_input_causes_package_errors_without_side_effects(run_hostile_case, name):
+    found = run_hostile_case(name)
     foreign = {step: outcome["said"] for step, outcome in found["steps"].items() if not outcome["ours"]}
     assert not foreign, foreign
     assert not found["touched"], "a file of the release or outside of it was changed"
@@ -60,28 +60,28 @@ def test_case(outcome_of, name):
     assert any(re.search(CASES[name].message, text) for text in said), said
 
 
-def card(**changes: Any) -> str:
+def policy_card(**changes: Any) -> str:
     return json.dumps({"widths": {"gru": 8}, "partners": 0, "shapes": {"params/a": [2]}} | changes)
 
 
 @pytest.mark.parametrize(
     ("policy", "weights", "message"),
     [
-        (card(widths={"gru": 2**40}), None, "gru = 1099511627776: expected `int` <= 8192"),
-        (card(widths={"spatial": [1] * 10**6}), None, "expected `array` of length <= 16"),
-        (card(shapes={"params/a": [2**40]}), None, "the card states"),
+        (policy_card(widths={"gru": 2**40}), None, "gru = 1099511627776: expected `int` <= 8192"),
+        (policy_card(widths={"spatial": [1] * 10**6}), None, "expected `array` of length <= 16"),
+        (policy_card(shapes={"params/a": [2**40]}), None, "the card states"),
         ("[]", None, "policy.json is not an object"),
-        (card(), (2**63 - 1).to_bytes(8, "little") + b"{}", "not a checkpoint"),
+        (policy_card(), (2**63 - 1).to_bytes(8, "little") + b"{}", "not a checkpoint"),
         (
-            card(),
+            policy_card(),
             (50).to_bytes(8, "little") + b'{"a":{"dtype":"F32","shape":[1000000000],"data_offsets":[0,4000000000]}}',
             "not a",
         ),
-        (card(), {"a": 1, "a/b": 1}, "not a checkpoint|the card states"),
-        (card(), TERABYTE, "expected at most"),
+        (policy_card(), {"a": 1, "a/b": 1}, "not a checkpoint|the card states"),
+        (policy_card(), TERABYTE, "expected at most"),
     ],
 )
-def test_a_hostile_checkpoint(tmp_path, policy, weights, message):
+def test_hostile_checkpoints_are_refused(tmp_path, policy, weights, message):
     (tmp_path / POLICY_CARD).write_text(policy)
     path = tmp_path / POLICY_WEIGHTS
     if isinstance(weights, bytes):
@@ -95,13 +95,13 @@ def test_a_hostile_checkpoint(tmp_path, policy, weights, message):
         load_policy(tmp_path)
 
 
-def test_a_pipe_for_a_checkpoint(tmp_path):
+def test_checkpoint_that_is_a_pipe_is_refused(tmp_path):
     os.mkfifo(tmp_path / POLICY_CARD)
     with pytest.raises(OptionError, match="not a regular file"):
         load_policy(tmp_path)
 
 
-def test_a_link_is_not_written_through(tmp_path):
+def test_atomic_write_does_not_follow_links(tmp_path):
     (tmp_path / "mine").write_text("mine")
     (tmp_path / ".file.partial").symlink_to(tmp_path / "mine")
     with atomic_write(tmp_path / "file") as partial:
@@ -109,20 +109,20 @@ def test_a_link_is_not_written_through(tmp_path):
     assert ((tmp_path / "mine").read_text(), (tmp_path / "file").read_text()) == ("mine", "new")
 
 
-def test_names_are_not_read_as_markup(damaged):
+def test_names_are_printed_without_interpreting_markup(damaged):
     path = damaged / "meta" / "histories.jsonl"
     path.write_text(path.read_text().replace("_coord_", "[/b][link=file:///]_coord_"))
     write_manifest(damaged)
     assert "[/b][link=file:///]" in run_cli("list", damaged)
 
 
-def test_the_depth_of_json_is_limited():
+def test_parse_json_limits_the_depth_of_nesting():
     assert parse_json('{"a": [[1]]}') == {"a": [[1]]}
     with pytest.raises(IndexFormatError, match="levels deep"):
         parse_json("[" * 65 + "]" * 65)
 
 
-def test_file_names_reserved_by_microsoft_windows(tmp_path):
+def test_file_names_reserved_by_microsoft_windows_are_refused(tmp_path):
     for name in ("con", "meta/NUL.json", "com1.h5/x", "a./b", "a /b", "data/teammate/aux/train.h5"):
         with pytest.raises(Icrl4ahtError, match="leads out"):
             parse_manifest(f"{'0' * 64}  {name}\n", "MANIFEST")
@@ -140,7 +140,7 @@ FOREIGN = (
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_files_that_no_release_has_are_refused(damaged, name):
+def test_unknown_file_names_in_a_manifest_are_refused(damaged, name):
     line = f"{'0' * 64}  {name}\n"
     with pytest.raises(UnsafePathError, match=r"not a file that a release may contain|leads out"):
         parse_manifest(line, "MANIFEST")
@@ -161,11 +161,11 @@ def test_files_that_no_release_has_are_refused(damaged, name):
         *("data/layout/coord_ring/train-00000-of-00010.h5", "meta/chunks/layout/coord_ring/train-00000-of-00010.npy"),
     ],
 )
-def test_files_that_releases_have_are_known(name):
+def test_known_file_names_in_a_manifest_are_accepted(name):
     assert list(parse_manifest(f"{'0' * 64}  {name}\n", "MANIFEST")) == [name]
 
 
-def test_findings_are_bounded_and_fit_for_a_terminal():
+def test_findings_are_escaped_and_limited_in_number_and_length():
     report = Report("r")
     report.add("a\x1b[2J\udcff", "x" * 10_000)
     for _ in range(100_009):

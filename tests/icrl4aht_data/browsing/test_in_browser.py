@@ -1,4 +1,4 @@
-"""The browse page in headless Chromium: decoding, drawing, keys, phone width and dark mode."""
+"""Test the page of `icrl4aht-data browse` in headless Chromium: decoding, drawing, keys, phone width and dark mode."""
 
 from __future__ import annotations
 
@@ -34,32 +34,32 @@ def dataset(tmp_path_factory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def file(dataset, tmp_path_factory) -> Path:
+def page_file(dataset, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("page") / "browse.html"
     save_browser_page(make_browser_page(dataset), path)
     return path
 
 
 @pytest.fixture(scope="module")
-def open_page(file) -> Iterator[OpenPage]:
-    """Open the page at an address in it, and wait for its data."""
+def open_page(page_file) -> Iterator[OpenPage]:
+    """Yield a function that opens the page in Chromium and waits until its data are decoded."""
     with chromium() as open_address:
 
-        def opened(address: str = "", path: Path = file, **options: Any) -> Any:
+        def open_and_wait(address: str = "", path: Path = page_file, **options: Any) -> Any:
             page = open_address(f"{path.as_uri()}{address}", **options)
             page.evaluate("opened")
             return page
 
-        yield opened
+        yield open_and_wait
 
 
-def table_of(page) -> dict[str, str]:
-    """Return the rows of the first pane."""
+def step_details(page) -> dict[str, str]:
+    """Return the table of step details in the first pane, as label -> text."""
     cells = page.locator(".pane").first.locator("th, td").all_inner_texts()
     return dict(zip(cells[::2], cells[1::2], strict=True))
 
 
-def test_decoded_states_equal_those_of_the_reader(open_page, dataset):
+def test_page_decodes_the_stored_arrays(open_page, dataset):
     page = open_page()
     assert page.evaluate("[chosen.history, chosen.episode, chosen.step]") == [0, 0, 0]
     decode = """async (position) => (await episodesOf(position)).map(({ records, rewards, actions, expert_actions }) =>
@@ -75,8 +75,8 @@ def test_decoded_states_equal_those_of_the_reader(open_page, dataset):
     page.close()
 
 
-def test_drawn_pixels_equal_draw_frame(open_page, dataset):
-    """Text and smoothed edges may differ, because the browser draws them."""
+def test_pixels_drawn_by_the_page_equal_draw_frame(open_page, dataset):
+    """Allow small differences, because the browser smooths text and edges in its own way."""
     for number in (0, len(dataset) - 1):
         history = dataset[number]
         layout = get_layout(history.entry.layout)
@@ -103,35 +103,35 @@ def test_drawn_pixels_equal_draw_frame(open_page, dataset):
         page.close()
 
 
-def test_details_shown_for_a_step(open_page, dataset):
+def test_page_shows_actions_reward_and_return_of_a_step(open_page, dataset):
     history = dataset[1]
     page = open_page(f"#history={history.entry.history_id}&episode=3&step=7")
     at, earned = 47, history.rewards[40:47].sum()
     names = {"Ego": "actions", "Expert": "expert_actions", "Oracle": "oracle_actions", "Teammate": "teammate_actions"}
     acted = {who: ACTIONS[int(history.read(field)[at])] for who, field in names.items()}
     marks = {who: "same" if acted[who] == acted["Ego"] else "differs" for who in ("Expert", "Oracle")}
-    assert table_of(page) == {
+    assert step_details(page) == {
         "Step": "7 of 20",
         "Return so far": f"{earned:g} of {history.returns()[2]:g}",
         "Reward of this step": f"{history.rewards[at]:+g}".replace("+0", "0"),
         **{f"{who}'s action": f"{name} ({marks[who]})" if who in marks else name for who, name in acted.items()},
     }
     page.keyboard.press("End")
-    assert table_of(page)["Ego's action"] == "none, the episode is over"
-    assert table_of(page)["Return so far"] == "{0:g} of {0:g}".format(history.returns()[2])
+    assert step_details(page)["Ego's action"] == "none, the episode is over"
+    assert step_details(page)["Return so far"] == "{0:g} of {0:g}".format(history.returns()[2])
     page.close()
 
 
-def test_choosing_and_keys(open_page, dataset):
+def test_keys_and_menus_change_the_shown_episode(open_page, dataset):
     page = open_page("#history=0&episode=3&step=0")
     shown = "document.querySelector('.pane figcaption').textContent.split(',')[0]"
     page.keyboard.press("n")
     wait_until(page, f"{shown} === 'Episode 4 of 6'")
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowRight")
-    assert table_of(page)["Step"] == "2 of 20"
+    assert step_details(page)["Step"] == "2 of 20"
     page.fill("#scrub", "13")
-    assert table_of(page)["Step"] == "13 of 20"
+    assert step_details(page)["Step"] == "13 of 20"
     page.focus("#curve")
     page.keyboard.press("Home")
     wait_until(page, f"{shown} === 'Episode 1 of 6'")
@@ -154,7 +154,7 @@ def test_choosing_and_keys(open_page, dataset):
     page.close()
 
 
-def test_playing_ends_with_the_episode_and_can_pause(open_page):
+def test_playback_stops_at_the_end_of_the_episode_and_can_be_paused(open_page):
     page = open_page("#history=0&episode=1&step=0")
     page.select_option("#speed", "50")
     page.keyboard.press(" ")
@@ -170,15 +170,15 @@ def test_playing_ends_with_the_episode_and_can_pause(open_page):
 
 
 @pytest.mark.parametrize("dark", [False, True])
-def test_a_phone_does_not_scroll_sideways(open_page, dark):
+def test_page_fits_the_width_of_a_phone(open_page, dark):
     page = open_page("#history=0&episode=1&step=3&ends=1", width=PHONE, dark=dark)
     assert page.locator(".pane").count() == 2
     check_phone(page, dark)
     page.close()
 
 
-def test_a_damaged_page_shows_an_error(open_page, file, tmp_path):
-    text = file.read_text()
+def test_a_damaged_page_shows_an_error(open_page, page_file, tmp_path):
+    text = page_file.read_text()
     at = text.index('"histories": ["') + 200
     (tmp_path / "damaged.html").write_text(text[:at] + "AAAA" + text[at + 4 :])
     page = open_page("", tmp_path / "damaged.html")

@@ -1,4 +1,4 @@
-"""The page of `icrl4aht-data browse`: embedded data equals the reader's, size limit, safe writing."""
+"""Test that the page of `icrl4aht-data browse` embeds the stored data, stays small, and is written safely."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ from tests.helpers.states import random_records
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
-    """Return a release with two layouts, two teammates each, and both kinds of labels."""
+    """Return a release on two layouts, with two teammates on each, with expert and oracle actions."""
     root = tmp_path_factory.mktemp("browse") / "release"
     sources = ("ppo", "noise", "ppo", "noise")
     random_release(root, oracle=True, sources=sources, episodes=8)
     return root
 
 
-def browse(*arguments: object, code: int = 0) -> str:
+def run_browse(*arguments: object, code: int = 0) -> str:
     return run_cli("browse", *arguments, code=code)
 
 
-def assert_embeds(page: bytes, dataset, shown: int | None = None) -> None:
-    """Check every frame of a page against the reader's arrays."""
+def assert_page_embeds(page: bytes, dataset, shown: int | None = None) -> None:
+    """Assert that every frame embedded in a page equals the stored arrays."""
     index, contents = embedded(page)
     assert [facts["history_id"] for facts in index["histories"]] == dataset.ids.tolist()
     for facts, content, history in zip(index["histories"], contents, dataset, strict=True):
@@ -58,7 +58,8 @@ def assert_embeds(page: bytes, dataset, shown: int | None = None) -> None:
         assert len(decoded) == (len(ends) if shown is None else min(shown, len(ends)))
         assert {0, len(ends) - 1} <= set(decoded)
         names = {"state", "rewards", "actions", "teammate_actions", "expert_actions"}
-        apart = history.entry.has_oracle_actions and history.entry.source != "noise"  # where both labels are equal
+        # The expert of a noise history is the oracle, so the page stores its labels only once.
+        apart = history.entry.has_oracle_actions and history.entry.source != "noise"
         names |= {"oracle_actions"} if apart else set()
         arrays = {name: history.read(name) for name in names}
         end_states = history.read("episode_end_state")
@@ -72,49 +73,49 @@ def assert_embeds(page: bytes, dataset, shown: int | None = None) -> None:
             assert frames["rewards"].sum() == returns[number]
 
 
-def test_embedded_episodes_are_those_of_the_reader(release):
+def test_embedded_episodes_equal_the_stored_episodes(release):
     dataset = load_icrl4aht(release)
     page = make_browser_page(dataset)
-    assert_embeds(page.html, dataset)
+    assert_page_embeds(page.html, dataset)
     total = int(dataset.column("episodes").sum())
     assert (page.histories, page.episodes, page.shown_episodes) == (len(dataset), total, total)
     assert len(repr(page)) < 100
 
 
-def test_histories_without_labels_have_no_columns_of_labels(tmp_path):
+def test_page_omits_label_columns_of_histories_without_labels(tmp_path):
     random_release(tmp_path / "r", labels=False, teammates=1, streams=1)
     index, _ = embedded(make_browser_page(load_icrl4aht(tmp_path / "r")).html)
     assert [facts["columns"] for facts in index["histories"]] == [["rewards", "actions", "teammate_actions"]] * 2
 
 
-def test_thirty_bundled_histories_stay_below_five_megabytes():
+def test_page_of_thirty_bundled_histories_is_below_five_megabytes():
     bundled = load_icrl4aht()
     chosen = bundled.select(spread_histories(bundled, 30))
     assert len(chosen) == 30
     shown, known = ({layout_title(one.name) for one in part.layouts} for part in (chosen, bundled))
     assert shown == known
     assert set(chosen.counts("source")) == set(bundled.counts("source"))
-    assert set(chosen.counts("teammate_kind")) > set(HEURISTIC_KINDS)  # and learned ones
+    assert set(chosen.counts("teammate_kind")) > set(HEURISTIC_KINDS)  # heuristic and learned teammates
     page = make_browser_page(chosen)
     assert len(page.html) < 5_000_000
     assert page.shown_episodes == page.episodes == chosen.column("episodes").sum()
-    assert_embeds(page.html, chosen)
+    assert_page_embeds(page.html, chosen)
 
 
-def test_large_selections_are_thinned_with_a_note(release):
+def test_page_above_the_size_limit_shows_fewer_episodes(release):
     dataset = load_icrl4aht(release)
     size = len(make_browser_page(dataset).html)
     page = make_browser_page(dataset, megabytes=0.9 * size / 1e6)
     assert len(page.html) < 0.9 * size
     assert page.shown_episodes < page.episodes
-    assert_embeds(page.html, dataset, shown=len(embedded(page.html)[0]["histories"][0]["shown"]))
+    assert_page_embeds(page.html, dataset, shown=len(embedded(page.html)[0]["histories"][0]["shown"]))
     with pytest.raises(OptionError, match=r"first and last episodes of 12 histories, expected less than 0\.05 MB"):
         make_browser_page(dataset, megabytes=0.05)
 
 
 @settings(deadline=None)
 @given(st.integers(1, 5000), st.integers(1, 400))
-def test_spread_episodes(number, most):
+def test_spread_episodes_returns_evenly_spaced_episodes(number, most):
     chosen = spread_episodes(number, most)
     assert {0, number - 1} <= set(chosen.tolist())
     assert len(chosen) == min(number, max(2, most))
@@ -124,7 +125,7 @@ def test_spread_episodes(number, most):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_every_state_can_be_drawn_from_the_page(layout):
+def test_drawings_stored_in_the_page_equal_the_shapes_of_each_state(layout):
     records = random_records(layout, 50, np.random.default_rng(0))
     drawings = layout_drawings(layout, records)
     json.dumps(drawings)
@@ -147,18 +148,18 @@ def test_the_page_is_self_contained(release):
     assert "href=" not in outside.replace('href="data:,"', "")
 
 
-def test_names_of_a_release_are_escaped(release, tmp_path):
+def test_name_of_the_release_is_escaped_in_html(release, tmp_path):
     hostile = shutil.copytree(release, tmp_path / "<b>$data&amp;<script>")
     html = make_browser_page(load_icrl4aht(hostile)).html.decode()
     assert "<h1>Learning histories of &lt;b&gt;$data&amp;amp;&lt;script&gt;</h1>" in html
     assert str(tmp_path) not in html
 
 
-class TestCommand:
-    def test_it_writes_a_page(self, release, tmp_path):
+class TestBrowseCommand:
+    def test_browse_writes_a_page(self, release, tmp_path):
         out = tmp_path / "page.html"
-        assert browse(release, "--out", out).startswith(f"{out}: 12 of 12 histories, all 96 episodes to watch, ")
-        facts = json.loads(browse(release, "--out", out, "--histories", 4, "--json"))
+        assert run_browse(release, "--out", out).startswith(f"{out}: 12 of 12 histories, all 96 episodes to watch, ")
+        facts = json.loads(run_browse(release, "--out", out, "--histories", 4, "--json"))
         assert facts == {
             "page": str(out),
             "histories": 4,
@@ -168,41 +169,41 @@ class TestCommand:
         }
         assert [facts["layout"] for facts in embedded(out.read_bytes())[0]["histories"]].count("demo_wide") == 2
 
-    def test_chosen_histories(self, release, tmp_path):
+    def test_history_option_selects_histories_in_the_given_order(self, release, tmp_path):
         out = tmp_path / "page.html"
-        browse(release, "--out", out, "--history", 5, "--history", 2, "--history", 5, "-q")
+        run_browse(release, "--out", out, "--history", 5, "--history", 2, "--history", 5, "-q")
         assert [facts["history_id"] for facts in embedded(out.read_bytes())[0]["histories"]] == [5, 2]
         with pytest.raises(UnknownNameError, match="99"):
-            browse(release, "--out", tmp_path / "other.html", "--history", 99)
+            run_browse(release, "--out", tmp_path / "other.html", "--history", 99)
 
-    def test_releases_without_states_are_refused(self, release, tmp_path):
+    def test_browse_refuses_releases_without_state_records(self, release, tmp_path):
         to_release(load_icrl4aht(release), tmp_path / "obs", "observations")
         with pytest.raises(NotStoredError, match="obs: a release of kind observations has no state records"):
-            browse(tmp_path / "obs", "--out", tmp_path / "page.html")
+            run_browse(tmp_path / "obs", "--out", tmp_path / "page.html")
         assert not (tmp_path / "page.html").exists()
 
-    def test_a_page_is_written_again_and_other_files_are_kept(self, release, tmp_path, monkeypatch):
+    def test_browse_overwrites_its_own_pages_but_no_other_files(self, release, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         for _ in range(2):
-            assert browse(release).startswith("browse.html: 12 of 12 histories")
+            assert run_browse(release).startswith("browse.html: 12 of 12 histories")
         (tmp_path / "browse.html").write_text("<!doctype html>\n<html><title>mine</title>")
         with pytest.raises(OptionError, match=r"browse\.html: exists; give another name, or replace it by --overwrite"):
-            browse(release)
+            run_browse(release)
         assert (tmp_path / "browse.html").read_text().endswith("<title>mine</title>")
 
 
-def test_impossible_states_and_actions_are_errors(release, monkeypatch):
+def test_impossible_states_and_actions_raise_errors(release, monkeypatch):
     history = load_icrl4aht(release)[0]
     read, wrong = History.read, []
 
-    def damaged(self, name, start=0, stop=None):
+    def read_damaged_rows(self, name, start=0, stop=None):
         rows = read(self, name, start, stop)
         if name in wrong:
             rows = rows.copy()
             rows[3] = 200
         return rows
 
-    monkeypatch.setattr(History, "read", damaged)
+    monkeypatch.setattr(History, "read", read_damaged_rows)
     for name, found in (("state", "a position"), ("expert_actions", "expert_actions below 6"), ("dones", "ends")):
         wrong.append(name)
         with pytest.raises(ReleaseError, match=f"history 0: .*{found}"):

@@ -1,4 +1,4 @@
-"""False values in meta/ under a valid manifest: `verify_release` recomputes and compares them."""
+"""Test that `verify_release` finds false values in meta/ although the manifest matches the files."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from tests.robustness.limits import time_limit
 
 
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory) -> Path:
-    """Return bundled PPO histories of a task with a learned teammate (read-only)."""
+def release(tmp_path_factory) -> Path:
+    """Return a release of the bundled PPO histories of one task with a learned teammate (read-only)."""
     dataset = load_icrl4aht(source="ppo", teammate_kind="fcp")
     return to_release(dataset.filter(task_id=dataset.entries[0].task_id), tmp_path_factory.mktemp("meta") / "r", "lite")
 
@@ -32,8 +32,8 @@ def first(content: dict[str, Any]) -> dict[str, Any]:
     return next(iter(content.values()))
 
 
-def test_the_unspoiled_release_is_valid(learned):
-    assert problems(learned, "quick") == problems(learned, "deep") == []
+def test_verify_accepts_the_undamaged_release(release):
+    assert problems(release, "quick") == problems(release, "deep") == []
 
 
 @pytest.mark.parametrize(
@@ -76,30 +76,30 @@ def test_the_unspoiled_release_is_valid(learned):
         (INFO, lambda c: first(c["statistics"]).update(disk_bytes=1), "statistics: expected"),
     ],
 )
-def test_false_values_are_found(learned, tmp_path, name, change, message):
-    dataset = load_icrl4aht(learned)
-    (note,) = read_provenance(learned / PROVENANCE).values()
+def test_verify_finds_false_values_in_meta_files(release, tmp_path, name, change, message):
+    dataset = load_icrl4aht(release)
+    (note,) = read_provenance(release / PROVENANCE).values()
     assert note.ego is not None
     environments = note.ego["environments"]
     numbers = {"recorded": note.streams_recorded, "environments": environments, "total": 2 * environments}
     message = message.format(stored=len(dataset), **numbers)
-    found = problems(spoiled(learned, tmp_path / "release", name, change), "quick")
+    found = problems(spoiled(release, tmp_path / "release", name, change), "quick")
     assert any(message in problem for problem in found), found
 
 
-def test_a_teammate_in_provenance_is_not_used(learned, tmp_path):
-    """Regression: provenance once replaced the task's teammate, although the task's id hashes it."""
-    root = spoiled(learned, tmp_path / "release", PROVENANCE, lambda c: first(c)["teammate"].update(family="brdiv"))
+def test_teammate_field_in_provenance_is_refused(release, tmp_path):
+    """Regression: a teammate in provenance.json once replaced the teammate stored with the task."""
+    root = spoiled(release, tmp_path / "release", PROVENANCE, lambda c: first(c)["teammate"].update(family="brdiv"))
     with pytest.raises(IndexFormatError, match="unknown field `family`"):
         load_icrl4aht(root).recover_teammate(0)
 
 
-def test_unsafe_versions_are_not_written(tmp_path):
+def test_write_release_refuses_invalid_data_versions(tmp_path):
     with pytest.raises(OptionError, match="data version '1': expected"):
         write_release(tmp_path / "out", "lite", [], data_version="1")
 
 
-def test_false_values_without_tasks_are_found(converted_release, tmp_path):
+def test_verify_finds_false_values_in_a_release_without_tasks(converted_release, tmp_path):
     for number, (change, message) in enumerate(
         (
             (lambda c: [line.update(seed=3) for line in c], "seed: expected -1 without tasks, found 3"),
@@ -110,9 +110,9 @@ def test_false_values_without_tasks_are_found(converted_release, tmp_path):
         assert any(message in problem for problem in found), found
 
 
-def test_unreferenced_files_are_found(learned, tmp_path):
+def test_verify_finds_unreferenced_shards_and_policies(release, tmp_path):
     root = tmp_path / "release"
-    shutil.copytree(learned, root)
+    shutil.copytree(release, root)
     policy = next(root.glob("teammates/*"))
     shutil.copytree(policy, policy.with_name("0" * 64))
     shard = next(root.rglob("*.h5"))
@@ -124,7 +124,7 @@ def test_unreferenced_files_are_found(learned, tmp_path):
 
 
 @pytest.mark.parametrize("with_info", [True, False])
-def test_a_sparse_terabyte_shard(damaged, with_info):
+def test_verify_reports_a_terabyte_shard_within_20_seconds(damaged, with_info):
     os.truncate(damaged / SHARD, 10**12)
     if not with_info:
         (damaged / INFO).unlink()
@@ -135,7 +135,7 @@ def test_a_sparse_terabyte_shard(damaged, with_info):
             assert sum("bytes, found" in problem for problem in found) == 1, found
 
 
-def test_a_sparse_terabyte_card(damaged):
+def test_verify_reports_a_terabyte_readme(damaged):
     os.truncate(damaged / "README.md", 10**12)
     found = problems(damaged, "quick")
     assert any("README.md: expected at most 4,294,967,296 bytes, found 1,000,000,000,000" in line for line in found)

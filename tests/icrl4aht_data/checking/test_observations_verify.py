@@ -1,4 +1,4 @@
-"""Releases of observations: faults found by `verify_release` and output of commands."""
+"""Test `verify_release` and commands on releases that store observations without state records."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from tests.helpers.spoiled import problems, spoil
 
 
 @pytest.fixture
-def copy(converted_release, tmp_path) -> Path:
-    """Return a copy of a release of observations, to damage."""
+def observations_copy(converted_release, tmp_path) -> Path:
+    """Return a copy of a release of observations that a test may damage."""
     return shutil.copytree(converted_release, tmp_path / "copy")
 
 
-def written(published_folder, tmp_path: Path, name: str, index: Any, value: Any) -> Path:
-    """Write the first history as a release with valid hashes and spoiled content."""
+def write_damaged_history(published_folder, tmp_path: Path, name: str, index: Any, value: Any) -> Path:
+    """Write the first published history, with one value changed, as a release with matching hashes."""
     arrays = {key: array.copy() for key, array in published_folder[1][0].items()}
     arrays[name][index] = value
     (task,) = make_tasks(["demo_wide"])
@@ -35,30 +35,31 @@ def written(published_folder, tmp_path: Path, name: str, index: Any, value: Any)
     return write_release(tmp_path / "r", "observations", [new], data_version="0.0.1", card="", kept_steps=KEPT)
 
 
-class TestVerify:
+class TestVerifyObservations:
     @pytest.mark.parametrize("level", ["full", "deep"])
-    def test_valid(self, converted_release, reconverted_release, level):
+    def test_verify_accepts_valid_observations(self, converted_release, reconverted_release, level):
         for root, transitions in ((converted_release, 360), (reconverted_release, 1440)):
             report = verify_release(root, level=level)
             assert report.ok, report.findings
             assert report.transitions == transitions
             assert [note[:20] for note in report.notes] == ["nothing was replayed"] * (level == "deep")
 
-    def test_deep_finds_an_impossible_observation(self, published_folder, tmp_path):
+    def test_deep_verification_finds_an_impossible_observation(self, published_folder, tmp_path):
         first = 2 * (7 + get_layout("demo_wide").ingredient_types)
-        root = written(published_folder, tmp_path, "obs", (33, slice(None), slice(None), first), 1)  # walls everywhere
+        # a wall in every cell
+        root = write_damaged_history(published_folder, tmp_path, "obs", (33, slice(None), slice(None), first), 1)
         assert problems(root) == []
         (found,) = problems(root, level="deep")
         assert found.endswith("obs: 1 steps do not show demo_wide from any cell of the ego's, first step 33")
 
-    def test_an_index_with_wrong_numbers(self, copy):
-        spoil(copy, HISTORIES, lambda c: (c[0].update(score=c[0]["score"] + 1), c[1].update(episodes=5)))
-        found = problems(copy)
+    def test_verify_finds_wrong_scores_and_episode_counts_in_the_index(self, observations_copy):
+        spoil(observations_copy, HISTORIES, lambda c: (c[0].update(score=c[0]["score"] + 1), c[1].update(episodes=5)))
+        found = problems(observations_copy)
         assert any("history 0: score: the index says" in line for line in found), found
         assert any("history 1: dones: expected 5 episodes of 20 steps, found 6" in line for line in found), found
 
 
-def test_convert_lists_missing_options(published_folder, tmp_path):
+def test_convert_accepts_observations_except_for_forms_that_need_states(published_folder, tmp_path):
     out = tmp_path / "out"
     said = run_cli("convert", published_folder[0], "--out", out, "--kept-steps", KEPT)
     assert said == f"{out}: observations, no state records: nothing can be replayed or drawn\n"

@@ -1,4 +1,4 @@
-"""`verify_release` finds every fault, in any file."""
+"""Test that `verify_release` finds every fault in any file of a release."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.helpers.random_releases import SHARD, make_tasks, one_history_release
 from tests.helpers.spoiled import problems, spoil
 
 
-def test_a_valid_release(lite_or_full):
+def test_deep_verification_accepts_a_valid_release(lite_or_full):
     report = verify_release(lite_or_full[0], level="deep")
     assert report.ok
     assert (report.histories, report.transitions) == (12, 1440)
@@ -37,8 +37,8 @@ def test_a_valid_release(lite_or_full):
     assert report.chunks >= 84
 
 
-def flipped(content: bytes, position: int, rng: np.random.Generator) -> bytes:
-    """Return the content with one random bit of a byte changed."""
+def flip_random_bit(content: bytes, position: int, rng: np.random.Generator) -> bytes:
+    """Return the content with one random bit flipped in the byte at `position`."""
     data = bytearray(content)
     data[position] ^= 1 << rng.integers(8)
     return bytes(data)
@@ -47,7 +47,7 @@ def flipped(content: bytes, position: int, rng: np.random.Generator) -> bytes:
 @pytest.mark.parametrize(
     ("release", "flips"), [("tiny", 40), ("observations", 20), pytest.param("tiny", 250, marks=pytest.mark.slow)]
 )
-def test_every_flipped_bit_is_found(converted_release, tmp_path, release, flips):
+def test_verify_finds_every_flipped_bit(converted_release, tmp_path, release, flips):
     root = tmp_path / "release"
     if release == "tiny":
         random_release(root, layouts=("cramped_up",), teammates=1, streams=1, episodes=3)
@@ -58,7 +58,7 @@ def test_every_flipped_bit_is_found(converted_release, tmp_path, release, flips)
         path = files[number % len(files)]
         content = path.read_bytes()
         position = int(rng.integers(len(content)))
-        path.write_bytes(flipped(content, position, rng))
+        path.write_bytes(flip_random_bit(content, position, rng))
         report = verify_release(root)
         assert not report.ok, (path, position)
         if path.name != "MANIFEST.sha256":
@@ -67,7 +67,7 @@ def test_every_flipped_bit_is_found(converted_release, tmp_path, release, flips)
     assert verify_release(root).ok
 
 
-def test_missing_and_extra_files(damaged):
+def test_verify_lists_missing_and_extra_files(damaged):
     (damaged / "meta" / "provenance.json").unlink()
     (damaged / "data" / "notes.txt").write_text("hello")
     assert problems(damaged) == [
@@ -77,15 +77,15 @@ def test_missing_and_extra_files(damaged):
 
 
 @pytest.mark.parametrize("name", ["meta/info.json", HISTORIES, "meta/tasks.jsonl", "meta/provenance.json"])
-def test_quick_checks_the_checksums_of_meta(damaged, name):
-    """Flip a bit of meta/ that only the checksum reveals."""
+def test_quick_verification_checks_the_checksums_of_meta_files(damaged, name):
+    """Append a space to a file of meta/; only its checksum reveals the change."""
     path = damaged / name
     path.write_text(path.read_text() + " ")
     assert name in verify_release(damaged, level="quick").files_at_fault
 
 
-def test_weights_are_in_the_folder_of_their_hash(tmp_path):
-    """Replaced weights of a policy are found even if the manifest lists them."""
+def test_verify_finds_weights_that_do_not_match_their_folder_name(tmp_path):
+    """Replace a policy's weights and update the manifest: the folder name still reveals the change."""
     root = shutil.copytree(MINI, tmp_path / "release")
     weights = next(root.glob("teammates/*/policy.safetensors"))
     weights.write_bytes(weights.read_bytes()[:-1] + b"?")
@@ -98,7 +98,7 @@ def test_weights_are_in_the_folder_of_their_hash(tmp_path):
 @pytest.mark.parametrize(
     ("name", "value"), [("expert_return", 0.5), ("expert_return_sampled", None), ("expert_step", 8)]
 )
-def test_expert_returns_match_the_provenance(tmp_path, name, value):
+def test_verify_finds_expert_returns_that_differ_from_provenance(tmp_path, name, value):
     labels = ExpertLabels("ab" * 32, "greedy", step=7, return_greedy=0.0, return_sampled=16.9, episodes=200)
     root = one_history_release(tmp_path / "r", provenance=Provenance(source="dqn", expert=labels))
     to_release(load_icrl4aht(root), tmp_path / "converted", "full")
@@ -112,7 +112,7 @@ def test_expert_returns_match_the_provenance(tmp_path, name, value):
     assert f"history 0: {name} {value}, but meta/provenance.json has" in problem
 
 
-def at(name, index, value):
+def change_value(name, index, value):
     def change(arrays):
         changed = arrays[name].copy()
         changed[index] = value(changed[index]) if callable(value) else value
@@ -124,15 +124,15 @@ def at(name, index, value):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (at("actions", 7, 6), "actions: expected 0..5, found"),
-        (at("teammate_actions", 7, -1), "teammate_actions: expected 0..5, found -1..5"),
-        (at("state", (7, 0), 255), "state has a position that is not reachable floor"),
-        (at("state", (7, 2), 255), "state has an unknown facing"),
-        (at("state", (3, 4), 2), "state has an impossible item in hand"),
-        (at("episode_end_state", (1, 6), 5), "episode_end_state has an impossible recipe"),
+        (change_value("actions", 7, 6), "actions: expected 0..5, found"),
+        (change_value("teammate_actions", 7, -1), "teammate_actions: expected 0..5, found -1..5"),
+        (change_value("state", (7, 0), 255), "state has a position that is not reachable floor"),
+        (change_value("state", (7, 2), 255), "state has an unknown facing"),
+        (change_value("state", (3, 4), 2), "state has an impossible item in hand"),
+        (change_value("episode_end_state", (1, 6), 5), "episode_end_state has an impossible recipe"),
     ],
 )
-def test_values_out_of_range(tmp_path, change, message):
+def test_verify_finds_values_out_of_range(tmp_path, change, message):
     root = one_history_release(tmp_path / "spoiled", change)
     for level in ("full", "deep"):
         found = problems(root, level)
@@ -142,10 +142,10 @@ def test_values_out_of_range(tmp_path, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (at("rewards", 33, 20), "replay: 1 rewards differ, first at step 33: rules 0.0, found 20.0"),
-        (at("state", (45, 3), lambda facing: (facing + 1) % 4), "do not lead to the recorded next state"),
-        (at("state", (40, 7), 1), "1 episodes do not start as the environment starts, first episode 2"),
-        (at("episode_end_state", (2, 5), 1), "do not lead to the recorded next state, first step 59"),
+        (change_value("rewards", 33, 20), "replay: 1 rewards differ, first at step 33: rules 0.0, found 20.0"),
+        (change_value("state", (45, 3), lambda facing: (facing + 1) % 4), "do not lead to the recorded next state"),
+        (change_value("state", (40, 7), 1), "1 episodes do not start as the environment starts, first episode 2"),
+        (change_value("episode_end_state", (2, 5), 1), "do not lead to the recorded next state, first step 59"),
         (lambda a: a | {"actions": np.roll(a["actions"], 1)}, "do not lead to the recorded next state"),
         (
             lambda a: a | {"state": np.where(np.arange(a["state"].shape[1]) == 6, 0b01010100, a["state"])},
@@ -153,29 +153,29 @@ def test_values_out_of_range(tmp_path, change, message):
         ),
     ],
 )
-def test_deep_finds_impossible_transitions(tmp_path, change, message):
+def test_deep_verification_finds_impossible_transitions(tmp_path, change, message):
     root = one_history_release(tmp_path / "spoiled", change)
     assert problems(root) == [], "only --deep looks at the physics"
     found = problems(root, level="deep")
     assert any(message in line for line in found), found
 
 
-def test_observations_that_differ_from_the_state(tmp_path, monkeypatch):
+def test_deep_verification_finds_observations_that_differ_from_the_state(tmp_path, monkeypatch):
     real = release.observe
 
-    def wrong(layout, record, agent):
+    def wrong_observe(layout, record, agent):
         seen = real(layout, record, agent).copy()
         seen[17, 2, 2, 0] = 0
         return seen
 
-    monkeypatch.setattr(release, "observe", wrong)
+    monkeypatch.setattr(release, "observe", wrong_observe)
     root = one_history_release(tmp_path / "spoiled", kind="full")
     assert problems(root) == []
     (found,) = problems(root, level="deep")
     assert found.endswith("obs: 1 steps differ from what their state shows, first step 17")
 
 
-def test_a_chunk_table_of_another_shard(damaged):
+def test_verify_finds_the_chunk_table_of_another_shard(damaged):
     other = damaged.with_name("other")
     random_release(other, streams=2)
     table = damaged / chunk_table_name(SHARD)
@@ -197,12 +197,12 @@ def test_a_chunk_table_of_another_shard(damaged):
         (lambda lines: lines[0].update(split="test"), "line 1: shard"),
     ],
 )
-def test_false_index_lines_are_found(damaged, change, message):
+def test_verify_finds_false_index_lines(damaged, change, message):
     spoil(damaged, HISTORIES, change)
     assert any(message in problem for problem in problems(damaged)), problems(damaged)
 
 
-def test_lost_shards_with_their_lines(tmp_path):
+def test_verify_finds_a_shard_without_index_lines(tmp_path):
     random_release(tmp_path / "r", layouts=("cramped_up",), teammates=1, streams=2, shard_histories=1)
     assert problems(tmp_path / "r") == []
     spoil(tmp_path / "r", INFO, lambda content: content.update(histories=1))
@@ -211,28 +211,28 @@ def test_lost_shards_with_their_lines(tmp_path):
     assert any("00001-of-00002.h5: the name of" in problem for problem in found), found
 
 
-def test_equal_histories_of_a_task(tmp_path):
+def test_verify_finds_equal_histories_of_a_task(tmp_path):
     root = one_history_release(tmp_path / "r", copies=2)
     assert problems(root)[0].endswith("history 1: has the content of history 0")
 
 
-def test_other_episode_lengths_than_stated(damaged):
+def test_verify_finds_episode_lengths_that_differ_from_info(damaged):
     spoil(damaged, INFO, lambda content: content["environment"].update(kept_steps=40))
     assert any("expected 6 episodes of 40 steps, found 6 in 120 steps" in p for p in problems(damaged))
 
 
 @pytest.mark.parametrize(("flips", "texts"), [(1, 1), pytest.param(6, 7, marks=pytest.mark.slow)])
-def test_no_damage_makes_verify_raise(damaged, flips, texts):
+def test_verify_never_raises_on_damaged_files(damaged, flips, texts):
     """With flipped bits or hostile texts in any file, verify reports problems and never raises."""
     rng = np.random.default_rng(7)
     hostile = [b'{"format_version": ' + b"9" * 5000 + b"}", b"[" * 5000, b"", b"[]", b"{}", b"null", b"\xff\xfe"]
     for path in sorted(p for p in damaged.rglob("*") if p.is_file()):
         content = path.read_bytes()
-        spoiled = [flipped(content, int(rng.integers(len(content))), rng) for _ in range(flips)]
+        spoiled = [flip_random_bit(content, int(rng.integers(len(content))), rng) for _ in range(flips)]
         for data in [*spoiled, *hostile[:texts], content[: len(content) // 2]]:
             path.write_bytes(data)
             assert not verify_release(damaged, level="deep").ok, path
-            if path.name != "MANIFEST.sha256":  # the manifest matches the damaged files
+            if path.name != "MANIFEST.sha256":  # verify again with a manifest that matches the damaged file
                 write_manifest(damaged)
                 verify_release(damaged, level="deep")
                 (damaged / "MANIFEST.sha256").unlink()
@@ -242,7 +242,7 @@ def test_no_damage_makes_verify_raise(damaged, flips, texts):
     assert verify_release(damaged, level="deep").ok
 
 
-def test_chunk_offsets_beyond_any_file(damaged):
+def test_verify_finds_chunk_offsets_beyond_the_end_of_the_shard(damaged):
     path = damaged / chunk_table_name(SHARD)
     table = np.load(path)
     table["offset"][3] = 2**63 + 5
@@ -251,16 +251,16 @@ def test_chunk_offsets_beyond_any_file(damaged):
     assert any("truncated" in problem for problem in problems(damaged))
 
 
-def test_a_group_where_a_dataset_should_be(damaged):
+def test_verify_finds_a_group_in_place_of_a_dataset(damaged):
     with h5py.File(damaged / SHARD, "r+") as file:
         del file["0/actions"]
         file.create_group("0/actions")
-    cover_again(damaged)
+    update_metadata_rows(damaged)
     assert any("hdf5" in problem.lower() for problem in problems(damaged)), problems(damaged)
 
 
-def cover_again(root):
-    """Correct the chunk table's rows of the bytes between the chunks, and the manifest."""
+def update_metadata_rows(root):
+    """Recompute the chunk table's rows for the bytes between chunks, then rewrite the manifest."""
     path = root / chunk_table_name(SHARD)
     table = np.load(path)
     chunks = table[table["rows"] > 0]
@@ -269,8 +269,8 @@ def cover_again(root):
 
 
 @pytest.mark.parametrize("heap", ["local", "global"])
-def test_an_endless_heap_in_a_shard(damaged, heap):
-    """Regression: libhdf5 follows a free list or an object that points to itself for ever."""
+def test_verify_terminates_on_a_shard_with_a_cyclic_heap(damaged, heap):
+    """Regression: libhdf5 never returns from a free list or heap object that points to itself."""
     path = damaged / SHARD
     if heap == "local":
         with h5py.File(path, "r+", libver="earliest") as file:
@@ -283,18 +283,18 @@ def test_an_endless_heap_in_a_shard(damaged, heap):
     else:
         struct.pack_into("<HHIQ", data, at + 16, 0, 0, 0, 0)
     path.write_bytes(data)
-    cover_again(damaged)
+    update_metadata_rows(damaged)
     command = [sys.executable, "-m", "icrl4aht_data", "verify", str(damaged)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert ("expected no local heap" in done.stdout) == (heap == "local"), done
 
 
-class TestCommand:
-    def test_valid(self, lite):
+class TestVerifyCommand:
+    def test_verify_command_prints_what_was_checked(self, lite):
         printed = run_cli("verify", "--deep", lite[0])
         assert "valid; checked 9 files, 84 chunks, 12 histories, 1,440 transitions and their physics" in printed
 
-    def test_damaged(self, damaged):
+    def test_verify_command_names_the_damaged_chunk(self, damaged):
         path = damaged / SHARD
         data = bytearray(path.read_bytes())
         data[int(np.load(damaged / chunk_table_name(SHARD))["offset"][0])] ^= 1
@@ -307,7 +307,7 @@ class TestCommand:
         assert {finding["file"] for finding in content["findings"]} == {SHARD}
 
 
-def test_a_teammate_of_training_and_test(tmp_path):
+def test_verify_finds_a_teammate_in_both_training_and_test(tmp_path):
     rng = np.random.default_rng(0)
     layout = get_layout("coord_simple")
     (train,) = make_tasks(["coord_simple"])

@@ -1,4 +1,4 @@
-"""The command line: list, show, error output and version."""
+"""Test the commands `list` and `show`, the option `--version`, error output, and that no data is overwritten."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.helpers.commands import run_cli, run_python
 from tests.helpers.paths import ROOT
 
 
-def test_list(lite):
+def test_list_prints_one_row_per_task(lite):
     rows = json.loads(run_cli("list", "--json", lite[0]))
     assert [(row["layout"], row["histories"], row["transitions"]) for row in rows] == [
         ("coord_simple", 3, 360),
@@ -37,7 +37,7 @@ def test_list(lite):
     assert "coord_simple" not in text
 
 
-def test_show_release_and_history(lite):
+def test_show_prints_facts_of_a_release_or_a_history(lite):
     release = json.loads(run_cli("show", "--json", lite[0]))
     assert (release["kind"], release["histories"], release["format_version"]) == ("lite", 12, FORMAT_VERSION)
     history = json.loads(run_cli("show", "--json", "--history", "7", lite[0]))
@@ -66,22 +66,22 @@ def test_list_and_show_print_sources_learners_and_labels(two_sources):
 
 
 @pytest.fixture
-def on_terminal(monkeypatch):
-    """Run a command as on a terminal of 80 columns; returns the lines that it prints."""
+def run_on_terminal(monkeypatch):
+    """Return a function that runs a command as on a terminal of 80 columns and returns the printed lines."""
 
-    def say(*arguments: str) -> list[str]:
+    def run(*arguments: str) -> list[str]:
         monkeypatch.setenv("COLUMNS", "80")
         monkeypatch.setattr("icrl4aht_data.commands.release_commands.is_terminal", lambda: True)
         printed = run_cli(*arguments)
         return printed.splitlines()
 
-    return say
+    return run
 
 
-def test_list_and_show_fit_a_terminal_of_80_columns(two_sources, on_terminal):
+def test_list_and_show_fit_a_terminal_of_80_columns(two_sources, run_on_terminal):
     root = str(two_sources[0])
     tasks = load_icrl4aht(root).counts("task_id")
-    listed = on_terminal("list", root)
+    listed = run_on_terminal("list", root)
     for task_id in tasks:
         assert sum(line.rstrip().endswith(f" {task_id[-8:]}") for line in listed) == 1
     assert [line.split() for line in listed[-2:]] == [[str(len(tasks)), "tasks", "40"], ["4,800"]]
@@ -89,13 +89,13 @@ def test_list_and_show_fit_a_terminal_of_80_columns(two_sources, on_terminal):
     ids = load_icrl4aht(root, task_id=next(iter(tasks))).ids.tolist()
     assert listed[3].split()[-1] == id_ranges(ids) == f"{ids[0]}-{ids[-1]}"
     assert all(" 5.0" in line for line in listed if line.startswith(("coord_simple", "demo_wide")) and "noise" in line)
-    shown = on_terminal("show", root)
+    shown = run_on_terminal("show", root)
     paragraph = " ".join(" ".join(shown[: shown.index("")]).split())
     assert paragraph.startswith("Dataset(40 histories of 12 tasks on demo_wide, coord_simple; ")
     assert "sources ppo (16), noise (24)" in paragraph and "lite release" in paragraph
     (total,) = [line.split() for line in shown if line.startswith("total")]
     assert total[1:5] == [str(len(tasks)), "40", "240", "4,800"]
-    one = on_terminal("show", root, "--history", "3")
+    one = run_on_terminal("show", root, "--history", "3")
     assert "history id" in " ".join(one) and "seed" in " ".join(one)
     assert f"return start: {load_icrl4aht(root)[3].entry.return_start}" in one
     assert f"    {get_layout('demo_wide').rows[0]}" in one
@@ -103,12 +103,12 @@ def test_list_and_show_fit_a_terminal_of_80_columns(two_sources, on_terminal):
         assert len(line) <= 80, line
 
 
-def test_ranges_of_ids():
+def test_id_ranges_joins_consecutive_ids():
     assert [id_ranges(ids) for ids in ([7], [5, 4, 3], [1, 2, 5, 9, 8])] == ["7", "3-5", "1-2,5,8-9"]
 
 
-def test_filters_by_source_reach_every_command(two_sources, tmp_path):
-    """Regression: `--source` once clashed with arguments of `verify` and `convert`."""
+def test_verify_and_convert_accept_the_source_filter(two_sources, tmp_path):
+    """Regression: the option `--source` once clashed with arguments of `verify` and `convert`."""
     root, out = str(two_sources[0]), str(tmp_path / "noise")
     for command in (
         ["verify", root, "--source", "noise"],
@@ -119,7 +119,7 @@ def test_filters_by_source_reach_every_command(two_sources, tmp_path):
     assert read_info(tmp_path / "noise").histories == 24
 
 
-def test_show_plots(lite, tmp_path):
+def test_show_plot_writes_a_figure_of_learning_curves(lite, tmp_path):
     from matplotlib.image import imread
 
     run_cli("show", lite[0], "--plot", tmp_path / "curves.png")
@@ -129,8 +129,8 @@ def test_show_plots(lite, tmp_path):
     assert len({tuple(pixel) for pixel in picture[::7, ::7].reshape(-1, picture.shape[-1])}) > 5
 
 
-def test_commands_destroy_nothing(lite, full, tmp_path):
-    """Run commands whose target is an existing release, a user's file or the source."""
+def test_commands_do_not_overwrite_existing_data(lite, full, tmp_path):
+    """Run commands with an existing release, a user's file or the source itself as the target."""
     shutil.copytree(full[0], tmp_path / "cb")
     shutil.copytree(lite[0], tmp_path / "ca")
     (tmp_path / "mine").mkdir()
@@ -139,8 +139,8 @@ def test_commands_destroy_nothing(lite, full, tmp_path):
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     ca, cb, mine = (str(tmp_path / name) for name in ("ca", "cb", "mine"))
     commands = [
-        ("combine", ca, cb),  # this once replaced `ca`
-        ("release", "build", ca, cb),  # and this `cb`
+        ("combine", ca, cb),  # regression: this command once replaced `ca`
+        ("release", "build", ca, cb),  # regression: this command once replaced `cb`
         ("convert", ca, cb, "--to", "full"),
         *(("combine", ca, "--out", target, *more) for target in (ca, cb, mine) for more in ((), ("--overwrite",))),
         *(("release", "build", ca, "--out", target) for target in (ca, cb, mine)),
@@ -150,7 +150,7 @@ def test_commands_destroy_nothing(lite, full, tmp_path):
         ("convert", ca, "--to", "parquet", "--out", f"{ca}/index.parquet"),
         ("show", ca, "--plot", f"{mine}/curves.png"),
     ]
-    commands.remove(("combine", ca, "--out", cb, "--overwrite"))  # `cb` is a release: replaced as demanded
+    commands.remove(("combine", ca, "--out", cb, "--overwrite"))  # `--overwrite` may replace the release `cb`
     for command in commands:
         result = CliRunner().invoke(cli, command)
         assert result.exit_code != 0, command
@@ -161,8 +161,8 @@ def test_commands_destroy_nothing(lite, full, tmp_path):
 
 
 @pytest.mark.parametrize(("arguments", "code"), [(["list"], 0), (["show", "--json"], 0), (["list", "--nope"], 2)])
-def test_closed_stdout_is_ignored(lite, monkeypatch, arguments, code):
-    """Regression: `list >&-` failed with an AttributeError."""
+def test_commands_run_without_stdout(lite, monkeypatch, arguments, code):
+    """Regression: the shell command `list >&-` failed with an AttributeError."""
     monkeypatch.setattr(sys, "argv", ["icrl4aht-data", *arguments, str(lite[0])])
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, None)
@@ -176,7 +176,7 @@ def test_closed_stdout_is_ignored(lite, monkeypatch, arguments, code):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("program", ["icrl4aht_data list", "icrl4aht_data show --json", "icrl4aht_data --help"])
-def test_a_closed_pipe_ends_a_command_quietly(program):
+def test_command_exits_silently_if_its_output_pipe_is_closed(program):
     reader, writer = os.pipe()
     os.close(reader)
     arguments = [sys.executable, "-m", *program.split()]
@@ -185,5 +185,5 @@ def test_a_closed_pipe_ends_a_command_quietly(program):
     assert (result.returncode, result.stderr) == (1, "")
 
 
-def test_version():
+def test_version_option_prints_the_installed_version():
     assert run_python("-m", "icrl4aht_data", "--version") == f"icrl4aht-data {version('icrl4aht-data')}\n"

@@ -1,4 +1,4 @@
-"""Command-line options generated from dataclasses: types, bounds, flags, defaults, given values."""
+"""Test command-line options generated from dataclasses: types, bounds, flags, defaults and given values."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class Options:
 @click.argument("name")
 @topic("Training", dataclass_options(Options, "given", exclude=["excluded"], default_text={"steps": "the size's"}))
 @click.option("--out", default="runs")
-def command(name: str, given: dict[str, Any], out: str) -> None:
+def example_command(name: str, given: dict[str, Any], out: str) -> None:
     click.echo(json.dumps({"given": given, "name": name, "out": out}))
 
 
-def call(*words: str) -> tuple[int, str]:
-    result = CliRunner().invoke(command, ["x", *words], terminal_width=200)
+def run_command(*words: str) -> tuple[int, str]:
+    result = CliRunner().invoke(example_command, ["x", *words], terminal_width=200)
     return result.exit_code, result.output
 
 
@@ -68,7 +68,7 @@ def call(*words: str) -> tuple[int, str]:
     ],
 )
 def test_only_given_values_reach_the_command(words, given):
-    code, output = call(*words.split())
+    code, output = run_command(*words.split())
     assert code == 0
     assert json.loads(output)["given"] == given
 
@@ -85,13 +85,13 @@ def test_only_given_values_reach_the_command(words, given):
         ("--internal 1", "No such option"),
     ],
 )
-def test_invalid_values_are_a_misuse(words, message):
-    code, output = call(*words.split())
+def test_invalid_option_values_exit_with_code_2(words, message):
+    code, output = run_command(*words.split())
     assert code == 2
     assert message in " ".join(output.split())
 
 
-def test_values_of_tables_replace_fields_of_nested_dataclasses():
+def test_replace_options_updates_fields_of_nested_dataclasses():
     base = Options(steps=7)
     changed = replace_options(base, {"dropout": 0.2, "widths": {"hidden": 8}, "discounts": [0.5]})
     assert asdict(changed) == asdict(base) | {"dropout": 0.2, "widths": {"hidden": 8}, "discounts": (0.5,)}
@@ -116,6 +116,6 @@ def test_values_of_tables_replace_fields_of_nested_dataclasses():
         ({"discounts": (0.5, -1.0)}, r"discounts = \(0.5, -1.0\): expected `float` >= 0.0 - at `\$\[1\]`"),
     ],
 )
-def test_a_dataclass_checks_its_own_values(values, message):
+def test_dataclass_refuses_invalid_values(values, message):
     with pytest.raises(OptionError, match=message):
         Options(**values)

@@ -1,4 +1,4 @@
-"""Stored bytes against the chunk table: damaged and forged chunks are refused by every reader."""
+"""Test that every reader refuses damaged or forged chunks by comparing bytes with the chunk table."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from tests.helpers.random_releases import SHARD
 
 
 @pytest.mark.parametrize("tail", [b"\0", bytes(100), zlib.compress(b"again")], ids=["a byte", "zeros", "a stream"])
-def test_bytes_behind_the_deflate_stream_are_refused(tail):
+def test_bytes_after_the_deflate_stream_are_refused(tail):
     data = encode_chunk(np.arange(12, dtype=np.uint8).reshape(4, 3), 4, 3)
     assert decode_chunk(data, 12, 3) == bytes(range(12))
     with pytest.raises(ValueError, match=f"expected no bytes after the deflate stream, found {len(tail)}"):
         decode_chunk(data + tail, 12, 3)
 
 
-def test_a_chunk_is_compared_with_its_row():
+def test_check_chunk_compares_size_crc32_and_hash():
     data, row = bytes(range(100)), np.zeros(1, CHUNK_DTYPE)[0]
     row["size"], row["rows"], row["crc32"] = len(data), 1, zlib.crc32(data)
     row["hash"] = np.frombuffer(chunk_hash(data), np.uint8)
@@ -41,9 +41,10 @@ def test_a_chunk_is_compared_with_its_row():
 
 
 @pytest.mark.parametrize("cache", CACHES)
-def test_a_changed_chunk_is_refused(damaged, tmp_path, monkeypatch, cache):
-    """Only its hash reveals the change, because its CRC-32 and the manifest are changed as well."""
-    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))  # without arrays of the undamaged release
+def test_changed_chunk_with_matching_crc32_is_refused(damaged, tmp_path, monkeypatch, cache):
+    """Change a chunk, its CRC-32 and the manifest; only the stored BLAKE2b hash reveals the change."""
+    # a new cache has no arrays of the undamaged release
+    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
     path, data = damaged / chunk_table_name(SHARD), bytearray((damaged / SHARD).read_bytes())
     table = np.load(path)
     start, end = int(table["offset"][0]), int(table["offset"][0] + table["size"][0])

@@ -1,4 +1,4 @@
-"""The index as columns: equal to its lines."""
+"""Test that the index, read as columns, equals the lines of meta/histories.jsonl."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from tests.helpers.random_releases import long_index
 
 
 @pytest.fixture(scope="module")
-def long(tmp_path_factory) -> tuple[Path, list[Entry]]:
+def long_release(tmp_path_factory) -> tuple[Path, list[Entry]]:
     root = tmp_path_factory.mktemp("long") / "release"
     return root, long_index(root)
 
 
-def test_entries_are_the_lines(long):
-    root, entries = long
+def test_index_entries_equal_the_written_lines(long_release):
+    root, entries = long_release
     index = read_index(root)
     assert list(index.entries) == entries
     assert index.entries[-1] == entries[-1]
 
 
 @pytest.fixture
-def rewritten(long, tmp_path) -> Callable[[Callable[[list[str]], str]], Index]:
-    """Change the lines of the long index and read it."""
-    shutil.copytree(long[0] / "meta", tmp_path / "meta")
+def read_changed_index(long_release, tmp_path) -> Callable[[Callable[[list[str]], str]], Index]:
+    """Return a function that changes the lines of a long index and reads the changed index."""
+    shutil.copytree(long_release[0] / "meta", tmp_path / "meta")
     path = tmp_path / "meta" / "histories.jsonl"
     lines = path.read_text().splitlines()
 
-    def read(change: Callable[[list[str]], str]) -> Index:
+    def write_and_read(change: Callable[[list[str]], str]) -> Index:
         path.write_text(change(lines), newline="")
         return read_index(tmp_path)
 
-    return read
+    return write_and_read
 
 
 @pytest.mark.parametrize(
@@ -53,8 +53,8 @@ def rewritten(long, tmp_path) -> Callable[[Callable[[list[str]], str]], Index]:
     ],
     ids=["compact", "no last newline", "spaces"],
 )
-def test_lines_may_be_formatted_otherwise(long, rewritten, change):
-    assert list(rewritten(change).entries) == long[1]
+def test_index_lines_may_differ_in_json_formatting(long_release, read_changed_index, change):
+    assert list(read_changed_index(change).entries) == long_release[1]
 
 
 @pytest.mark.parametrize(
@@ -68,13 +68,13 @@ def test_lines_may_be_formatted_otherwise(long, rewritten, change):
     ],
     ids=["empty", "two on one line", "one on two lines", "leading zero", "not finite"],
 )
-def test_each_line_has_exactly_one_object(rewritten, change, number):
+def test_index_line_without_exactly_one_object_raises_error(read_changed_index, change, number):
     with pytest.raises(IndexFormatError, match=rf"histories\.jsonl, line {number}: "):
-        rewritten(lambda lines: "".join(f"{line}\n" for line in change(lines)))
+        read_changed_index(lambda lines: "".join(f"{line}\n" for line in change(lines)))
 
 
-def test_queries_find_what_a_scan_finds(long):
-    root, entries = long
+def test_index_queries_match_a_scan_of_all_entries(long_release):
+    root, entries = long_release
     index = read_index(root)
     for wanted in (
         {},
@@ -113,10 +113,10 @@ def test_queries_find_what_a_scan_finds(long):
         ({"history_id": 5000}, "ids count up"),
     ],
 )
-def test_a_bad_line_of_many_is_named(rewritten, where, change, message):
-    def spoil(lines: list[str]) -> str:
+def test_error_names_the_number_of_an_invalid_index_line(read_changed_index, where, change, message):
+    def spoil_line(lines: list[str]) -> str:
         bad = json.dumps(json.loads(lines[where]) | change)
         return "".join(f"{line}\n" for line in [*lines[:where], bad, *lines[where + 1 :]])
 
     with pytest.raises(IndexFormatError, match=rf"histories\.jsonl, line {where + 1}: .*({message})"):
-        rewritten(spoil)
+        read_changed_index(spoil_line)

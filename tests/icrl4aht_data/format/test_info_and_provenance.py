@@ -1,4 +1,4 @@
-"""meta/info.json and meta/provenance.json: round trips and malformed content."""
+"""Test meta/info.json and meta/provenance.json: round trips and malformed content."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icrl4aht_data.format.schema import INFO, PROVENANCE
 from icrl4aht_data.utils.files import write_json
 
 
-def test_the_bundled_release_is_written_as_it_was_read(tmp_path):
+def test_info_and_provenance_of_the_bundled_release_round_trip(tmp_path):
     write_json(tmp_path / "info.json", read_info(MINI).to_json())
     assert (tmp_path / "info.json").read_bytes() == (MINI / INFO).read_bytes()
     found = read_provenance(MINI / PROVENANCE)
@@ -23,12 +23,12 @@ def test_the_bundled_release_is_written_as_it_was_read(tmp_path):
     assert (tmp_path / "provenance.json").read_bytes() == (MINI / PROVENANCE).read_bytes()
 
 
-def test_unknown_fields_of_a_provenance_are_kept():
+def test_provenance_keeps_unknown_fields():
     note = {"seed": 3, "laboratory": {"city": "elsewhere"}, "other": [1]}
     assert Provenance.from_json(note).to_json() == note
 
 
-def test_headroom_with_a_learned_teammate_uses_its_partners_return():
+def test_headroom_of_a_learned_teammate_uses_its_self_play_return():
     assert not ReferenceEgos(2.0, 4.75, 6.0, 20).has_headroom
     learned = ReferenceEgos(2.0, 4.75, 6.0, 20, self_play=10.0)
     assert learned.has_headroom
@@ -39,7 +39,7 @@ def test_headroom_with_a_learned_teammate_uses_its_partners_return():
     assert "self_play" not in made.to_json()["references"]
 
 
-def test_expert_fields_are_kept():
+def test_provenance_keeps_expert_fields():
     labels = {"policy_sha256": "ab" * 32, "action": "greedy", "step": 7, "return_greedy": 0.0, "return_sampled": 16.9}
     note = {"xla_threads": 2, "expert": labels | {"episodes": 200, "last_return_greedy": -1.0}}
     found = Provenance.from_json(note)
@@ -62,7 +62,7 @@ def test_expert_fields_are_kept():
         ([], "expected a JSON object"),
     ],
 )
-def test_a_malformed_provenance_is_named(tmp_path, note, message):
+def test_malformed_provenance_raises_error_that_names_the_fault(tmp_path, note, message):
     (tmp_path / "provenance.json").write_text(json.dumps({"task": note}))
     with pytest.raises(IndexFormatError, match=rf"provenance\.json: malformed provenance of task 'task': .*{message}"):
         read_provenance(tmp_path / "provenance.json")
@@ -78,7 +78,7 @@ def test_a_malformed_provenance_is_named(tmp_path, note, message):
         ({"data_version": "\x1b[2J"}, r"data version '\\x1b\[2J': expected a SemVer version such as 1.0.0"),
     ],
 )
-def test_a_malformed_info_says_what_is_wrong(change, message):
+def test_malformed_info_raises_error_that_names_the_fault(change, message):
     content = json.loads((MINI / INFO).read_text())
     with pytest.raises(IndexFormatError, match=message):
         ReleaseInfo.from_json(content | change)

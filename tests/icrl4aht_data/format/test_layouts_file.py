@@ -1,4 +1,4 @@
-"""Releases that carry layouts, and tasks that fix their dishes."""
+"""Test releases that store their own layouts, and tasks that fix the recipes."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ MINE = Layout("mine-3-5", "mine-3-5", ROWS, ((0, 0, 1), (0, 1, 1)))
 
 
 @pytest.fixture(autouse=True)
-def fresh(monkeypatch):
-    """Each test begins like a process that has not opened a release with layouts."""
+def forget_release_layouts(monkeypatch):
+    """Forget the layouts of opened releases, so each test starts like a new process."""
     monkeypatch.setattr(known_layouts, "_RELEASE_LAYOUTS", {})
 
 
 @pytest.fixture
-def root(tmp_path, fresh, monkeypatch) -> Path:
-    """Return a release with histories on a layout of its own and on a published one, unknown to this process."""
+def root(tmp_path, forget_release_layouts, monkeypatch) -> Path:
+    """Return a release on a published layout and on a layout that only this release defines."""
     add_layouts([MINE])
     random_release(tmp_path / "release", layouts=("coord_simple", "mine-3-5"), teammates=1, streams=2)
     monkeypatch.setattr(known_layouts, "_RELEASE_LAYOUTS", {})
@@ -50,7 +50,7 @@ def root(tmp_path, fresh, monkeypatch) -> Path:
     return tmp_path / "release"
 
 
-def test_tasks_of_a_release_are_read_with_its_layouts(root):
+def test_reading_tasks_of_a_release_also_reads_its_layouts(root):
     with pytest.raises(TaskFormatError, match="unknown layout 'mine-3-5'"):
         read_tasks(root / TASKS)
     tasks = read_tasks_and_layouts(root / TASKS)
@@ -61,23 +61,23 @@ def test_tasks_of_a_release_are_read_with_its_layouts(root):
         read_tasks_and_layouts(root / TASKS)
 
 
-def rewritten(root: Path, lines: list[Any]) -> Path:
+def write_layout_lines(root: Path, lines: list[Any]) -> Path:
     (root / LAYOUTS_FILE).write_text("".join(json.dumps(line) + "\n" for line in lines))
     write_manifest(root)
     return root
 
 
-def stored(root: Path) -> list[dict[str, Any]]:
+def stored_layouts(root: Path) -> list[dict[str, Any]]:
     return read_lines(root / LAYOUTS_FILE)
 
 
-def test_long_lists_are_cut():
+def test_listed_names_shortens_long_lists():
     assert listed_names([str(i) for i in range(200)]) == "0, 1, 2, 3, 4, 5, 6, 7, 8 and 191 others"
 
 
-class TestRelease:
-    def test_layouts_come_with_it(self, root):
-        assert stored(root) == [
+class TestReleaseWithLayouts:
+    def test_release_stores_and_loads_its_own_layouts(self, root):
+        assert stored_layouts(root) == [
             {
                 "name": "mine-3-5",
                 "map": list(ROWS),
@@ -96,8 +96,8 @@ class TestRelease:
         assert batch.obs.shape == (4, 20, 5, 5, 46)
         assert verify_release(root, level="deep").ok
 
-    def test_commands_take_their_names(self, root):
-        """The names of a release's layouts are known once it is read, and those of the package's own tasks always."""
+    def test_commands_accept_names_of_release_layouts(self, root):
+        """Layout names of a release are known once the release is read; names of package layouts are always known."""
         printed = run_cli("list", root, "--layout", "mine-3-5")
         assert "mine-3-5" in printed and "coord_simple" not in printed
         with pytest.raises(UnknownNameError, match="unknown layout 'nowhere'"):
@@ -106,7 +106,7 @@ class TestRelease:
         with pytest.raises(BadParameter, match="unknown layout 'nowhere'"):
             LAYOUT.convert("nowhere", None, None)
 
-    def test_filter_by_family(self, root):
+    def test_layout_family_filter_selects_histories(self, root):
         ds = load_icrl4aht(root, layout_family="mine")
         assert set(ds.column("layout")) == {"mine-3-5"} and len(ds) == 2
         assert set(load_icrl4aht(root, layout_family="published").column("layout")) == {"coord_simple"}
@@ -114,13 +114,13 @@ class TestRelease:
         with pytest.raises(UnknownNameError, match=r"layout_family 'rooms'; valid: published, mine"):
             load_icrl4aht(root, layout_family="rooms")
 
-    def test_a_dataset_brings_them_to_another_process(self, root, monkeypatch):
+    def test_unpickled_dataset_restores_its_layouts(self, root, monkeypatch):
         sent = pickle.dumps(load_icrl4aht(root))
         monkeypatch.setattr(known_layouts, "_RELEASE_LAYOUTS", {})
         ds = pickle.loads(sent)
         assert ds[-1].obs.shape == (120, 5, 5, 35) and get_layout("mine-3-5").rows == ROWS
 
-    def test_without_layouts_of_its_own_it_has_no_file(self, tmp_path):
+    def test_release_of_published_layouts_has_no_layouts_file(self, tmp_path):
         random_release(tmp_path / "plain", layouts=("coord_simple",), teammates=1, streams=1)
         assert not (tmp_path / "plain" / LAYOUTS_FILE).exists()
 
@@ -151,26 +151,26 @@ class TestRelease:
             (lambda lines: [lines[0] | {"name": "mine"}], r"expected .* \('other', None, None\)"),
         ],
     )
-    def test_refused(self, root, change, message):
+    def test_invalid_stored_layouts_are_refused(self, root, change, message):
         with pytest.raises(IndexFormatError, match=message):
-            load_icrl4aht(rewritten(root, change(stored(root))))
+            load_icrl4aht(write_layout_lines(root, change(stored_layouts(root))))
 
-    def test_layouts_of_other_releases_do_not_count(self, root):
+    def test_missing_layouts_file_is_refused_even_if_the_layout_is_known(self, root):
         load_icrl4aht(root)
         (root / LAYOUTS_FILE).unlink()
         write_manifest(root)
         with pytest.raises(IndexFormatError, match=r"layout 'mine-3-5' is neither published nor in meta/layouts.jsonl"):
             load_icrl4aht(root)
 
-    def test_one_name_for_two_maps(self, root, tmp_path):
+    def test_two_releases_cannot_use_one_name_for_different_maps(self, root, tmp_path):
         load_icrl4aht(root)
-        other = [stored(root)[0] | {"map": ["WWPWW", *ROWS[1:]]}]
+        other = [stored_layouts(root)[0] | {"map": ["WWPWW", *ROWS[1:]]}]
         with pytest.raises(IndexFormatError, match="give the new layout another name"):
-            load_icrl4aht(rewritten(root, other))
+            load_icrl4aht(write_layout_lines(root, other))
 
 
 class TestRecipesOfATask:
-    def test_they_replace_the_layouts(self, tmp_path):
+    def test_recipes_of_a_task_replace_the_recipes_of_its_layout(self, tmp_path):
         (plain,), (task,) = make_tasks(["demo_wide"]), make_tasks(["demo_wide"], recipes=((0, 0, 1),))
         assert task.task_id != plain.task_id and task.layout.recipes == ((0, 0, 1),)
         assert plain.layout is get_layout("demo_wide") and task.layout is task.layout
@@ -188,17 +188,17 @@ class TestRecipesOfATask:
             ("000", "recipes"),
         ],
     )
-    def test_refused(self, recipes, message):
+    def test_parse_task_refuses_invalid_recipes(self, recipes, message):
         (task,) = make_tasks(["demo_wide"])
         with pytest.raises(TaskFormatError, match=message):
             parse_task(task_fields(task) | {"recipes": recipes})
 
-    def test_made_with_impossible_ones(self):
+    def test_make_task_refuses_recipes_of_unavailable_ingredients(self):
         (task,) = make_tasks(["demo_wide"])
         with pytest.raises(TaskFormatError, match="no pile"):
             make_task(task.track, task.split, "demo_wide", task.teammate, 0, [(0, 0, 7)])
 
-    def test_the_replay_expects_them(self, tmp_path):
+    def test_histories_and_verification_use_the_recipes_of_the_task(self, tmp_path):
         root = tmp_path / "release"
         random_release(root, layouts=("coord_simple",), teammates=1, streams=1, recipes=((0, 0, 1),))
         ds = load_icrl4aht(root)
@@ -209,13 +209,13 @@ class TestRecipesOfATask:
         assert verify_release(root, level="deep").ok
         (task,) = read_tasks(root / TASKS)
         plain = dataclasses.replace(task, recipes=None)
-        write_tasks(root / TASKS, [plain])  # the same id: only the recipes of the histories tell
+        write_tasks(root / TASKS, [plain])  # the stored id still hashes the removed recipes
         write_manifest(root)
         with pytest.raises(TaskFormatError, match="does not match the task's content"):
             read_tasks(root / TASKS)
 
 
-def test_a_release_cannot_change_a_layout_of_the_packages_own_tasks():
+def test_add_layouts_refuses_to_change_a_layout_of_the_package():
     known = get_layout("rooms-0-46")
     assert add_layouts([known]) == [known]
     with pytest.raises(OptionError, match="layout 'rooms-0-46': differs from the known layout of this name"):

@@ -1,4 +1,4 @@
-"""Files of a release are checked against its manifest before they are used."""
+"""Test that files of a release are checked against its manifest before use."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, T
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.damages import DAMAGES, flip_bit, restore
 from tests.helpers.random_releases import SHARD
-from tests.robustness.limits import permissions_count
+from tests.robustness.limits import enforced_permissions
 
 UNNOTICED = "a bit flipped, times as before"
 
@@ -30,7 +30,7 @@ UNNOTICED = "a bit flipped, times as before"
         *((name, damage) for name in (HISTORIES, TASKS, chunk_table_name(SHARD)) for damage in DAMAGES),
     ],
 )
-def test_a_damaged_file_is_an_error_that_names_it(damaged, name, damage):
+def test_damaged_file_raises_error_with_its_path(damaged, name, damage):
     path = damaged / name
     right = path.read_bytes()
     DAMAGES[damage](path)
@@ -50,18 +50,18 @@ def test_an_empty_manifest_is_refused(damaged):
         assert any(finding.file == MANIFEST and "empty: expected" in finding.problem for finding in report.findings)
 
 
-def test_a_file_of_meta_that_the_manifest_does_not_list(damaged):
+def test_meta_file_missing_from_the_manifest_is_refused(damaged):
     path = damaged / MANIFEST
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(line for line in lines if PROVENANCE not in line))
     with pytest.raises(IndexFormatError, match=rf"{PROVENANCE}: .*{MANIFEST} does not list this file; fetch"):
         load_icrl4aht(damaged)
-    (damaged / PROVENANCE).unlink()  # this file is optional
+    (damaged / PROVENANCE).unlink()  # a release may have no provenance.json
     load_icrl4aht(damaged)
     check_against_manifest(damaged, [INFO, chunk_table_name(SHARD)])
 
 
-def test_files_that_change_after_opening_are_checked_when_they_are_read(damaged):
+def test_files_changed_after_opening_raise_errors_when_read(damaged):
     dataset = load_icrl4aht(damaged)
     for name in (TASKS, PROVENANCE):
         flip_bit(damaged / name)
@@ -73,7 +73,7 @@ def test_files_that_change_after_opening_are_checked_when_they_are_read(damaged)
         dataset[0].read("actions")
 
 
-def test_checkpoints_are_checked_before_they_are_copied_or_loaded(tmp_path):
+def test_damaged_checkpoints_are_neither_loaded_nor_copied(tmp_path):
     shutil.copytree(MINI, tmp_path / "release")
     dataset = load_icrl4aht(tmp_path / "release", teammate_family="rl")[:1]
     digest = dataset.recover_teammate(int(dataset.ids[0]))["theta"]["sha256"]
@@ -89,9 +89,12 @@ def test_checkpoints_are_checked_before_they_are_copied_or_loaded(tmp_path):
 
 @pytest.mark.parametrize("name", [MANIFEST, INFO, HISTORIES, chunk_table_name(SHARD), SHARD])
 @pytest.mark.parametrize("cache", ["ram", "mmap", "stream"])
-def test_a_file_without_permission_to_read(damaged, tmp_path, monkeypatch, name, cache):
+def test_unreadable_file_raises_error_with_its_path(damaged, tmp_path, monkeypatch, name, cache):
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
     (damaged / name).chmod(0)
-    with permissions_count(), pytest.raises(ReleaseError, match=f"{damaged / name}: cannot be read: Permission denied"):
+    with (
+        enforced_permissions(),
+        pytest.raises(ReleaseError, match=f"{damaged / name}: cannot be read: Permission denied"),
+    ):
         load_icrl4aht(damaged, layout="coord_simple", cache=cache, threads=1).ad(batch_size=2, length=5)[0]
     shutil.rmtree(tmp_path / "cache", ignore_errors=True)

@@ -1,4 +1,4 @@
-"""The published test tasks: ids derived from the parameters, and equal bundled manifests."""
+"""Test task ids against the published ids, and bundled manifests against newly generated tasks."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ cramped_room_down utility_greedy 187d848e ed1fd3ea 4016d5da 610b126b c35fde55
 """layout, family, and the last eight digits of the ids of t0..t4, as the published manifests have them."""
 
 
-def test_the_ids_are_the_160_published_ones():
+def test_task_ids_equal_the_160_published_ids():
     expected = []
     for line in PUBLISHED_HASHES.split("\n")[1:-1]:
         layout, family, *hashes = line.split()
@@ -62,7 +62,7 @@ def test_the_ids_are_the_160_published_ones():
 
 
 @pytest.mark.parametrize("track", TRACKS)
-def test_bundled_manifests_are_the_validation_tasks(track):
+def test_bundled_validation_manifests_equal_the_generated_tasks(track):
     tasks = read_tasks(manifest_path(track, "validation"))
     assert tasks == validation_tasks(track)
     assert {task.layout.name for task in tasks} <= {*TRACKS[track]["validation"]}
@@ -70,13 +70,13 @@ def test_bundled_manifests_are_the_validation_tasks(track):
 
 @pytest.mark.parametrize("split", ["train", "validation"])
 @pytest.mark.parametrize("track", TRACKS)
-def test_bundled_manifests_are_the_diverse_tasks(track, split):
+def test_bundled_diverse_manifests_equal_the_generated_tasks(track, split):
     tasks = read_tasks(manifest_path(track, split, "diverse"))
     assert tasks == diverse_tasks(track, split)
     assert {task.layout.name for task in tasks} == {*TRACKS[track]["train"]}
 
 
-def test_check_fails_on_a_difference(monkeypatch, tmp_path):
+def test_manifests_check_command_fails_on_a_difference(monkeypatch, tmp_path):
     short = tmp_path / "short.jsonl"
     tasks.write_tasks(short, published_tasks("layout")[:-1])
     run_cli("research manifests --check")
@@ -94,7 +94,7 @@ def test_check_fails_on_a_difference(monkeypatch, tmp_path):
         ({"theta": [1]}, r"line 1: teammate: expected `object`, got `array` - at `\$\.theta`"),
     ],
 )
-def test_wrong_teammates_are_named_with_their_line(tmp_path, change, message):
+def test_invalid_teammate_raises_error_with_line_and_fault(tmp_path, change, message):
     task = published_tasks("layout")[0]
     path = tmp_path / "tasks.jsonl"
     write_tasks(path, [replace(task, teammate=task.teammate | change)])

@@ -1,4 +1,4 @@
-"""Additions of format version 4: oracle actions, independent learners, sources, left-out tasks."""
+"""Test additions of format version 4: oracle actions, independent learners, sources and left-out tasks."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ SOURCES = ("noise", "ppo", "ppo", "noise")
 
 
 @pytest.fixture(scope="module", params=KINDS)
-def mixed(request, tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """Return releases of each kind with both sources, two PPO learners and oracle actions (read-only)."""
+def mixed_release(request, tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
+    """Return a release of each kind with PPO and noise histories, two learners and oracle actions (read-only)."""
     root = tmp_path_factory.mktemp("mixed") / request.param
     options: dict[str, Any] = {"streams": 2, "episodes": 5, "oracle": True, "learners": 2, "sources": SOURCES}
     experts = [SCRIPT if source == "noise" else None for source in SOURCES]
@@ -41,12 +41,12 @@ def mixed(request, tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarr
 
 @pytest.fixture(scope="module")
 def lite_mixed(tmp_path_factory) -> Path:
-    """Return a small lite release with a noise task, two PPO learners and all provenance fields."""
+    """Return a small lite release with a noise task, a task of two PPO learners, and all provenance fields."""
     root = tmp_path_factory.mktemp("mixed") / "lite"
     options: dict[str, Any] = {"streams": 2, "episodes": 5, "oracle": True, "learners": 2, "sources": SOURCES[:2]}
     random_release(root, "lite", ("coord_simple",), experts=[SCRIPT, None], **options)
 
-    def complete(content: dict[str, Any]) -> None:
+    def add_optional_fields(content: dict[str, Any]) -> None:
         noise, ppo = content.values()
         noise["noise"] = {"histories": 2, "episodes": 5, "start": [0.9, 1.0], "end": [0, 0.1], "power": [0.5, 2.0]}
         ppo["ego"] = {"total_steps": 100, "environments": 2}
@@ -55,11 +55,11 @@ def lite_mixed(tmp_path_factory) -> Path:
             one["nearest_test"] = {"teammate": "H3/t1", "distance": 0.25}
         noise["nearest_test"]["behaviour"] = 3
 
-    return spoiled(root, root.with_name("complete"), PROVENANCE, complete)
+    return spoiled(root, root.with_name("complete"), PROVENANCE, add_optional_fields)
 
 
-def test_arrays_round_trip(mixed):
-    root, written = mixed
+def test_oracle_actions_learners_and_sources_round_trip(mixed_release):
+    root, written = mixed_release
     dataset = load_icrl4aht(root)
     for history in dataset:
         found = history.read("oracle_actions")
@@ -77,12 +77,12 @@ def test_arrays_round_trip(mixed):
     assert dataset.filter(source="noise").ids.tolist() == [0, 1, 10, 11]
 
 
-def test_verification_lists_unchecked_facts(mixed, lite_mixed):
-    report = verify_release(mixed[0], level="deep")
+def test_deep_verification_lists_facts_it_cannot_check(mixed_release, lite_mixed):
+    report = verify_release(mixed_release[0], level="deep")
     assert report.ok, report.findings
     (note,) = report.notes
     assert note.startswith("oracle actions of 12 histories: only their range was checked")
-    assert verify_release(mixed[0]).notes == []
+    assert verify_release(mixed_release[0]).notes == []
     report = verify_release(lite_mixed, level="deep")
     assert report.ok, report.findings
     assert [note.split(":")[0] for note in report.notes] == [
@@ -93,8 +93,8 @@ def test_verification_lists_unchecked_facts(mixed, lite_mixed):
     ]
 
 
-def test_published_files_omit_the_additions(lite_mixed, tmp_path):
-    """Published files keep oracle actions of noise only and number all streams consecutively."""
+def test_published_files_omit_oracle_actions_and_learner_numbers(lite_mixed, tmp_path):
+    """Published files have no oracle actions, and number the streams of a task's learners consecutively."""
     before = load_icrl4aht(lite_mixed)
     to_published(before, tmp_path / "files")
     with h5py.File(tmp_path / "files" / "histories.h5") as file:
@@ -138,7 +138,7 @@ def test_published_files_omit_the_additions(lite_mixed, tmp_path):
         (PROVENANCE, lambda c: first(c)["expert"].update(policy_sha256="0" * 64), "the script labels noise histories"),
     ],
 )
-def test_false_values_are_found(lite_mixed, tmp_path, name, change, message):
+def test_verify_finds_false_learners_sources_and_provenance(lite_mixed, tmp_path, name, change, message):
     found = "\n".join(problems(spoiled(lite_mixed, tmp_path / "release", name, change), "deep"))
     assert message in found
 
@@ -158,12 +158,12 @@ def last(content: dict[str, Any]) -> dict[str, Any]:
         (lambda a: {"expert_actions": (a["oracle_actions"] + 1) % 6}, "differ from the script's, oracle_actions"),
     ],
 )
-def test_false_arrays_are_found(tmp_path, change, message):
-    def changed(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def test_verify_finds_false_oracle_and_expert_actions(tmp_path, change, message):
+    def change_labels(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         labelled = arrays | {"oracle_actions": arrays["expert_actions"]}
         return labelled | change(labelled)
 
-    root = one_history_release(tmp_path / "r", changed, provenance=Provenance(source="noise"))
+    root = one_history_release(tmp_path / "r", change_labels, provenance=Provenance(source="noise"))
     assert message in "\n".join(problems(root))
 
 
@@ -176,7 +176,7 @@ def test_a_learner_number_out_of_range_is_rejected(tmp_path):
 LEFT_OUT = LeftOutTask("task_x", "demo_wide", "H3/t12", "ppo", 2, 32, 0.1, 0.4, "the learners did not learn")
 
 
-def left_out(root: Path, *tasks: LeftOutTask) -> Path:
+def set_left_out(root: Path, *tasks: LeftOutTask) -> Path:
     info = replace(read_info(root), left_out=list(tasks))
     (root / INFO).write_text(json.dumps(info.to_json()))
     write_manifest(root)
@@ -185,17 +185,17 @@ def left_out(root: Path, *tasks: LeftOutTask) -> Path:
 
 def test_conversions_keep_left_out_tasks(lite_mixed, tmp_path):
     other = replace(LEFT_OUT, layout="coord_simple", learners=0, streams=0, return_start=None, return_end=None)
-    root = left_out(shutil.copytree(lite_mixed, tmp_path / "a"), LEFT_OUT, other)
+    root = set_left_out(shutil.copytree(lite_mixed, tmp_path / "a"), LEFT_OUT, other)
     assert verify_release(root, level="deep").ok
     assert load_icrl4aht(root).info.left_out == [LEFT_OUT, other]
-    to_release(load_icrl4aht(root), tmp_path / "out", "full")  # keeps left-out tasks of the selected layouts
+    to_release(load_icrl4aht(root), tmp_path / "out", "full")  # conversion drops left-out tasks of other layouts
     assert read_info(tmp_path / "out").left_out == [other]
     random_release(tmp_path / "b", layouts=("demo_wide",), teammates=1, streams=1)
     made = load_icrl4aht(tmp_path / "b").entries[0].task_id
-    left_out(tmp_path / "b", other)
-    left_out(root, LEFT_OUT, other, replace(LEFT_OUT, task_id=made))
+    set_left_out(tmp_path / "b", other)
+    set_left_out(root, LEFT_OUT, other, replace(LEFT_OUT, task_id=made))
     combine_releases(tmp_path / "both", [root, tmp_path / "b"])
-    assert read_info(tmp_path / "both").left_out == [LEFT_OUT, other]  # each once, except the task contained in b
+    assert read_info(tmp_path / "both").left_out == [LEFT_OUT, other]  # no duplicates, and no tasks that have histories
     assert verify_release(tmp_path / "both").ok
 
 
@@ -206,14 +206,14 @@ def test_conversions_keep_left_out_tasks(lite_mixed, tmp_path):
         ({"reason": "\x1b[2J"}, "printable characters"),
     ],
 )
-def test_left_out_tasks_are_checked(lite_mixed, tmp_path, change, message):
+def test_invalid_left_out_tasks_are_refused(lite_mixed, tmp_path, change, message):
     task = replace(LEFT_OUT, **change)
     root = shutil.copytree(lite_mixed, tmp_path / "r")
     with pytest.raises(IndexFormatError, match=message):
-        read_info(left_out(root, task))
+        read_info(set_left_out(root, task))
 
 
-def test_a_left_out_task_has_no_histories(lite_mixed, tmp_path):
+def test_verify_finds_histories_of_a_left_out_task(lite_mixed, tmp_path):
     task_id = load_icrl4aht(lite_mixed).entries[0].task_id
-    root = left_out(shutil.copytree(lite_mixed, tmp_path / "r"), replace(LEFT_OUT, task_id=task_id))
+    root = set_left_out(shutil.copytree(lite_mixed, tmp_path / "r"), replace(LEFT_OUT, task_id=task_id))
     assert f"left_out: task '{task_id}' has histories in the index" in "\n".join(problems(root))

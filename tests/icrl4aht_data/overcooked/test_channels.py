@@ -1,4 +1,4 @@
-"""Canonical channels: own channels at their canonical positions, all others 0."""
+"""Test canonical channels: a layout's channels move to canonical positions, and all others are 0."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from tests.helpers.states import random_records
 each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 
 
-def placed(layout: Layout, own: np.ndarray) -> np.ndarray:
-    """Return own observations moved to the canonical channels by name."""
+def to_canonical_by_name(layout: Layout, own: np.ndarray) -> np.ndarray:
+    """Return a layout's observations with each channel moved to the canonical position of its name."""
     out = np.zeros((*own.shape[:-1], 46), own.dtype)
     for number, name in enumerate(channel_names(layout)):
         out[..., CANONICAL_CHANNELS.index(name)] = own[..., number]
@@ -30,7 +30,7 @@ def placed(layout: Layout, own: np.ndarray) -> np.ndarray:
 
 
 @each_layout
-def test_names_and_places(layout):
+def test_channel_names_match_canonical_positions(layout):
     names, places = channel_names(layout), canonical_positions(layout)
     assert len(names) == layout.channels == len(set(names))
     assert names == tuple(CANONICAL_CHANNELS[place] for place in places)
@@ -39,7 +39,7 @@ def test_names_and_places(layout):
     assert observation_shape(layout, canonical=True) == (5, 5, len(CANONICAL_CHANNELS)) == (5, 5, 46)
 
 
-def test_the_canonical_channels_are_the_union():
+def test_canonical_channels_are_the_union_over_all_layouts():
     assert set(CANONICAL_CHANNELS) == {name for layout in LAYOUTS.values() for name in channel_names(layout)}
     assert channel_names(get_layout("test_wide")) == CANONICAL_CHANNELS
     assert CANONICAL_CHANNELS[:8] == (
@@ -48,17 +48,17 @@ def test_the_canonical_channels_are_the_union():
     )  # fmt: skip
 
 
-def test_a_channel_that_no_layout_has_is_refused():
+def test_canonical_positions_refuses_unknown_channels():
     layout = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),))
     with pytest.raises(OptionError, match=r"layout mine: channels \['self_ingredient_4', .* are not among the 46"):
         canonical_positions(layout)
 
 
 @each_layout
-def test_own_channels_are_mapped_and_others_are_0(layout):
+def test_canonical_observations_equal_channels_moved_by_name(layout):
     records = random_records(layout, 200, np.random.default_rng(5))
     for agent in (0, 1):
-        expected = placed(layout, observe(layout, records, agent))
+        expected = to_canonical_by_name(layout, observe(layout, records, agent))
         assert expected.any()
         np.testing.assert_array_equal(to_canonical(layout, observe(layout, records, agent)), expected, strict=True)
         np.testing.assert_array_equal(observe(layout, records, agent, canonical=True), expected, strict=True)

@@ -1,4 +1,4 @@
-"""`fast_observe` equals the reference implementation `observe`."""
+"""Test that `fast_observe` equals the reference implementation `observe`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ each_kind = pytest.mark.parametrize("canonical", [False, True], ids=["own", "can
 @each_layout
 @each_kind
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
-def test_random_states(layout, canonical, dtype):
-    """Items, pots, timers, buttons and deliveries are drawn independently."""
+def test_fast_observe_equals_observe_on_random_states(layout, canonical, dtype):
+    """Compare on states with independently drawn items, pots, timers, buttons and deliveries."""
     rng = np.random.default_rng(2)
     where = columns(layout)
     states = rng.integers(0, 256, (3000, record_size(layout))).astype(np.uint8)
@@ -38,7 +38,7 @@ def test_random_states(layout, canonical, dtype):
 @pytest.mark.parametrize(
     ("column", "value"), [("positions", 0), ("recipe", 77), ("delivered", 2), ("facings", 4), ("pot_timers", 99)]
 )
-def test_records_that_the_rules_exclude(column, value, canonical):
+def test_fast_observe_equals_observe_on_invalid_records(column, value, canonical):
     layout = get_layout("coord_simple")
     states = random_history(layout, 4, 20, np.random.default_rng(3))["state"]
     states[7, getattr(columns(layout), column)] = value
@@ -47,7 +47,7 @@ def test_records_that_the_rules_exclude(column, value, canonical):
     np.testing.assert_array_equal(found, observe(layout, states, 0, canonical))
 
 
-def test_shapes_and_empty_input():
+def test_fast_observe_accepts_batch_shapes_and_empty_input():
     layout = get_layout("cramped_up")
     states = random_history(layout, 2, 6, np.random.default_rng(4))["state"].reshape(3, 4, -1)
     out = fast_observe(layout, states, np.empty((3, 4, *layout.obs_shape), np.uint8))

@@ -1,6 +1,6 @@
-"""Observations in hand-drawn scenes; layouts; the state record's columns and faults.
+"""Test observations of hand-drawn scenes, layouts, and the columns and faults of state records.
 
-Most scenes are in cramped_up:
+Most scenes use the layout cramped_up:
 
       01234
     0 WWPWW
@@ -29,7 +29,7 @@ CRAMPED, RING, SIMPLE, WIDE = (LAYOUTS[name] for name in ("cramped_up", "coord_r
 PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece of ingredient 0 and of ingredient 1
 RECIPE_000, RECIPE_111 = 3 * ZERO, 3 * ONE
 
-SPECIFIED = {  # name: (alias, width, height, n, C), from the specification
+SPECIFIED = {  # name: (alias, width, height, ingredient types, channels), from the specification
     "coord_simple": ("grounded_coord_simple", 8, 5, 3, 40),
     "coord_ring": ("grounded_coord_ring", 9, 9, 3, 40),
     "test_simple": ("test_time_simple", 8, 5, 3, 41),
@@ -64,8 +64,8 @@ def channel_names(n: int, delivery: bool) -> list[str]:
     ]
 
 
-def seen(layout: Layout, record: np.ndarray, agent: int) -> dict[str, Cells]:
-    """Return channel -> map cell (x, y) -> value, for all nonzero values."""
+def nonzero_channels(layout: Layout, record: np.ndarray, agent: int) -> dict[str, Cells]:
+    """Return all nonzero values of an agent's observation, as channel -> map cell (x, y) -> value."""
     _, _, _, n, channels = SPECIFIED[layout.name]
     names = channel_names(n, layout.name in ("test_simple", "test_wide"))
     assert len(names) == channels
@@ -79,15 +79,15 @@ def seen(layout: Layout, record: np.ndarray, agent: int) -> dict[str, Cells]:
     return found
 
 
-def at(value: int, *cells: tuple[int, int]) -> Cells:
+def cells_with(value: int, *cells: tuple[int, int]) -> Cells:
     return dict.fromkeys(cells, value)
 
 
-# Layouts
+# Tests of layouts
 
 
 @each_layout
-def test_layouts_are_those_of_the_specification(layout):
+def test_layouts_match_the_specification(layout):
     assert list(LAYOUTS) == list(SPECIFIED)
     found = (layout.alias, layout.width, layout.height, layout.ingredient_types, layout.channels)
     assert found == SPECIFIED[layout.name]
@@ -102,12 +102,12 @@ def test_layouts_are_those_of_the_specification(layout):
     ("wrong", "nearest"),
     [("cramped_upp", "cramped_up"), ("test_time_wid", "test_time_wide"), ("coordring", "coord_ring"), ("7", None)],
 )
-def test_an_unknown_layout_lists_the_names_and_the_nearest(wrong, nearest):
+def test_unknown_layout_raises_error_with_valid_and_nearest_names(wrong, nearest):
     hint = f" Did you mean '{nearest}'?" if nearest else ""
     with pytest.raises(UnknownNameError, match=rf"unknown layout '{wrong}'.*\.{re.escape(hint)}$") as error:
         get_layout(wrong)
     listed = str(error.value).split("valid: ")[1].split(".")[0].split(", ")
-    # Releases that other tests opened may have made further layouts known.
+    # Other tests may have opened releases with more layouts.
     assert set(listed) >= {*SPECIFIED, *(alias for alias, *_ in SPECIFIED.values())}
 
 
@@ -142,10 +142,10 @@ def test_a_possible_map_is_accepted():
     assert [room.tolist() for room in layout.rooms] == [[6, 7, 8]] * 2
 
 
-# Observations
+# Tests of observations
 
 
-def test_a_complete_scene_seen_by_the_ego():
+def test_observation_of_a_scene_has_the_expected_nonzero_channels():
     """Check all nonzero channels; from (1, 1) the window covers x = -1..3, y = -1..3."""
     record = state_record(
         CRAMPED,
@@ -157,26 +157,26 @@ def test_a_complete_scene_seen_by_the_ego():
         pot_timers=[13],
         counters={(1, 0): ONE, (0, 2): PLATE, (2, 3): PLATE + COOKED + 3 * ONE},
     )
-    assert seen(CRAMPED, record, 0) == {
-        "self position": at(1, (1, 1)),
-        "self left": at(1, (1, 1)),
-        "self 0": at(1, (1, 1)),
-        "other position": at(1, (3, 2)),
-        "other down": at(1, (3, 2)),
-        "other plate": at(1, (3, 2)),
-        "other cooked": at(1, (3, 2)),
-        "other 0": at(2, (3, 2)),
-        "other 1": at(1, (3, 2)),
-        "wall": at(1, (0, 0), (1, 0), (3, 0), (0, 2), (0, 3), (2, 3)),
-        "goal": at(1, (3, 3)),
-        "pot": at(1, (2, 0)),
-        "plates": at(1, (1, 3)),
-        "pile 0": at(1, (0, 1)),
-        "item plate": at(1, (0, 2), (2, 3)),
-        "item cooked": at(1, (2, 3)),
-        "item 0": at(2, (2, 0)),
+    assert nonzero_channels(CRAMPED, record, 0) == {
+        "self position": cells_with(1, (1, 1)),
+        "self left": cells_with(1, (1, 1)),
+        "self 0": cells_with(1, (1, 1)),
+        "other position": cells_with(1, (3, 2)),
+        "other down": cells_with(1, (3, 2)),
+        "other plate": cells_with(1, (3, 2)),
+        "other cooked": cells_with(1, (3, 2)),
+        "other 0": cells_with(2, (3, 2)),
+        "other 1": cells_with(1, (3, 2)),
+        "wall": cells_with(1, (0, 0), (1, 0), (3, 0), (0, 2), (0, 3), (2, 3)),
+        "goal": cells_with(1, (3, 3)),
+        "pot": cells_with(1, (2, 0)),
+        "plates": cells_with(1, (1, 3)),
+        "pile 0": cells_with(1, (0, 1)),
+        "item plate": cells_with(1, (0, 2), (2, 3)),
+        "item cooked": cells_with(1, (2, 3)),
+        "item 0": cells_with(2, (2, 0)),
         "item 1": {(1, 0): 1, (2, 0): 1, (2, 3): 3},
-        "pot timer": at(13, (2, 0)),
+        "pot timer": cells_with(13, (2, 0)),
     }
 
 
@@ -184,25 +184,27 @@ def test_a_complete_scene_seen_by_the_ego():
     ("layout", "goal", "poses", "deliverer"),
     [(SIMPLE, (7, 2), [(1, 1, "up"), (6, 2, "right")], 1), (WIDE, (2, 0), [(2, 1, "up"), (2, 4, "up")], 0)],
 )
-def test_a_correct_delivery_shows_on_the_goal_for_one_step(layout, goal, poses, deliverer):
+def test_delivery_channel_marks_the_goal_for_one_step(layout, goal, poses, deliverer):
     hands, actions = [0, 0], [STAY, STAY]
     hands[deliverer], actions[deliverer] = RECIPE_000 + PLATE + COOKED, INTERACT
     record = state_record(layout, *poses, hands=hands)
     next_recipe = np.array([RECIPE_111], np.uint8)
-    assert "delivery" not in seen(layout, record, deliverer)
+    assert "delivery" not in nonzero_channels(layout, record, deliverer)
     after = rules.step(layout, record, np.array([actions]), next_recipe)
     assert after.reward == 20
-    assert seen(layout, after.state, deliverer)["delivery"] == at(1, goal)
-    assert "delivery" not in seen(layout, after.state, 1 - deliverer)  # the goal is outside this window
+    assert nonzero_channels(layout, after.state, deliverer)["delivery"] == cells_with(1, goal)
+    assert "delivery" not in nonzero_channels(
+        layout, after.state, 1 - deliverer
+    )  # the goal is outside the other agent's window
     later = rules.step(layout, after.state, np.array([[STAY, STAY]]), next_recipe)
-    assert "delivery" not in seen(layout, later.state, deliverer)
+    assert "delivery" not in nonzero_channels(layout, later.state, deliverer)
 
 
-# The state record
+# Tests of state records
 
 
 @each_layout
-def test_unpacking_and_packing_round_trips(layout):
+def test_unpack_then_pack_returns_the_same_records(layout):
     records = np.random.default_rng(6).integers(0, 256, (2, 64, record_size(layout)), dtype=np.uint8)
     state = unpack(layout, records)
     again = pack(state)
@@ -212,7 +214,7 @@ def test_unpacking_and_packing_round_trips(layout):
     assert [np.shape(field)[2:] for field in state[:8]] == [(2,), (2,), (2,), (), (), (pots,), (pots,), (buttons,)]
 
 
-def test_a_start_has_empty_hands_pots_and_counters():
+def test_start_state_has_empty_hands_pots_and_counters():
     positions, facings = np.array([[10, 13]], np.uint8), np.array([[3, 2]], np.uint8)
     record = start_record(RING, positions, facings, np.array([RECIPE_111], np.uint8))
     np.testing.assert_array_equal(record[0, :7], [10, 13, 3, 2, 0, 0, RECIPE_111])
@@ -233,8 +235,8 @@ def test_possible_states_have_no_faults(layout):
 
 IMPOSSIBLE = {
     "a position that is not reachable floor": [
-        {"positions": [0, 13]},  # a wall
-        {"positions": [11, 20]},  # past the map's last cell
+        {"positions": [0, 13]},  # cell 0 is a wall
+        {"positions": [11, 20]},  # cell 20 is outside the map
     ],
     "two agents on one cell": [{"positions": [11, 11]}],
     "an unknown facing": [{"facings": [0, 4]}],
@@ -244,7 +246,7 @@ IMPOSSIBLE = {
             [2 * ZERO, 0],
             [COOKED + RECIPE_000, 0],
             [PLATE + COOKED + 2 * ZERO, 0],
-            [0, 64],  # a third type, which the layout does not have
+            [0, 64],  # 64 is an ingredient that the layout does not have
         )
     ],
     "an impossible item on a counter": [{"counters": {(1, 0): 2 * ONE}}, {"counters": {(2, 3): COOKED + RECIPE_111}}],
@@ -263,14 +265,14 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize(("kind", "change"), [(kind, change) for kind in IMPOSSIBLE for change in IMPOSSIBLE[kind]])
-def test_each_impossible_value_is_found(kind, change):
+def test_faults_finds_each_impossible_value(kind, change):
     record = state_record(CRAMPED, (1, 1, "up"), (3, 2, "up"), **change)
     assert faults(CRAMPED, record) == [kind]
     good = state_record(CRAMPED, (1, 1, "up"), (3, 2, "up"))
     assert faults(CRAMPED, np.concatenate([good, record, good])) == [kind]
 
 
-def test_an_impossible_button_timer_and_several_faults_are_found():
+def test_faults_lists_several_faults_of_one_state():
     record = state_record(RING, (1, 1, "up"), (3, 3, "up"), buttons=[10, 11])
     assert faults(RING, record) == ["a button timer above its limit"]
     record[:, columns(RING).facings] = 7
@@ -278,7 +280,7 @@ def test_an_impossible_button_timer_and_several_faults_are_found():
 
 
 @each_layout
-def test_layouts_know_whether_the_ego_can_see_the_recipe(layout):
+def test_shows_recipe_tells_whether_observations_contain_the_recipe(layout):
     views = observe(layout, random_records(layout, 500, np.random.default_rng(0)), 0)
     names = channel_names(layout.ingredient_types, layout.indicates_delivery)
     shown = [number for number, name in enumerate(names) if name.startswith("recipe")]

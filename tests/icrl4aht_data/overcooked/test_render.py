@@ -1,4 +1,4 @@
-"""Pictures of states: every visible thing changes the pixels of its own cell, and no others."""
+"""Test pictures of states: each visible thing changes only the pixels of its own cell."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from icrl4aht_data.overcooked.state import columns
 from tests.helpers.states import random_records, state_record
 
 CELL = 32
-COORD = LAYOUTS["coord_simple"]  # has a pot, a button, an indicator and three ingredients
+COORD = LAYOUTS["coord_simple"]  # this layout has a pot, a button, an indicator and three ingredients
 ONION, TOMATO = COORD.recipe_items.tolist()[0] // 3, COORD.recipe_items.tolist()[1] // 3
 DISH = 3 * ONION | PLATE | COOKED
 
 
-def frame_of(ego=(2, 2, "down"), teammate=(5, 3, "up"), **fields) -> np.ndarray:
+def draw_scene(ego=(2, 2, "down"), teammate=(5, 3, "up"), **fields) -> np.ndarray:
     return draw_frame(COORD, state_record(COORD, ego, teammate, **fields)[0], cell=CELL, view=False)
 
 
@@ -37,33 +37,33 @@ def changed_cells(before: np.ndarray, after: np.ndarray, layout=COORD) -> set[in
     }
 
 
-def share(pixels: np.ndarray, strong: int, weak: tuple[int, int], least: int = 80) -> float:
+def dominant_share(pixels: np.ndarray, strong: int, weak: tuple[int, int], least: int = 80) -> float:
     """Return the share of pixels whose channel `strong` exceeds both others by `least`."""
     return float((pixels[..., strong] > pixels[..., list(weak)].max(axis=-1) + least).mean())
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_every_layout_draws_with_a_blue_ego_and_a_red_teammate(layout):
+def test_every_layout_is_drawn_with_a_blue_ego_and_a_red_teammate(layout):
     for record in random_records(layout, 5, np.random.default_rng(0)):
         record[columns(layout).hands] = 0
         frame = draw_frame(layout, record, cell=CELL, caption="step 12   return 20")
         assert frame.dtype == np.uint8
         assert frame.shape == (round((layout.height + 0.8) * CELL), layout.width * CELL, 3)
         ego, teammate = (cell_pixels(frame, layout, int(record[agent])) for agent in (EGO, TEAMMATE))
-        assert share(ego, 2, (0, 1)) > 0.15 > share(ego, 0, (1, 2))
-        assert share(teammate, 0, (1, 2)) > 0.15 > share(teammate, 2, (0, 1))
+        assert dominant_share(ego, 2, (0, 1)) > 0.15 > dominant_share(ego, 0, (1, 2))
+        assert dominant_share(teammate, 0, (1, 2)) > 0.15 > dominant_share(teammate, 2, (0, 1))
 
 
-def test_all_facings_and_all_things_in_hand_look_different():
+def test_all_facings_and_held_items_look_different():
     items = (0, PLATE, ONION, TOMATO, DISH, 3 * TOMATO | PLATE | COOKED)
     for ego in (True, False):
         seen = set()
         for facing in ("up", "down", "right", "left"):
             for item in items:
                 if ego:
-                    frame = frame_of(ego=(2, 2, facing), hands=(item, 0))
+                    frame = draw_scene(ego=(2, 2, facing), hands=(item, 0))
                 else:
-                    frame = frame_of(teammate=(5, 3, facing), hands=(0, item))
+                    frame = draw_scene(teammate=(5, 3, facing), hands=(0, item))
                 seen.add(frame.tobytes())
         assert len(seen) == 4 * len(items)
 
@@ -78,23 +78,23 @@ def test_all_facings_and_all_things_in_hand_look_different():
     ],
     ids=["filling", "cooking", "cooked", "lamp"],
 )
-def test_pots_and_buttons_show_their_state_on_their_own_cell(thing, fields):
-    frames = [frame_of(**options) for options in fields]
+def test_pot_and_button_states_change_only_their_own_cells(thing, fields):
+    frames = [draw_scene(**options) for options in fields]
     assert len({frame.tobytes() for frame in frames}) == len(frames)
     assert all(changed_cells(frames[0], frame) == set(getattr(COORD, thing)) for frame in frames[1:])
 
 
-def test_the_recipe_shows_on_the_indicator_in_the_footer_and_on_a_lit_button():
+def test_recipe_is_drawn_on_indicator_footer_and_lit_buttons():
     recipes = COORD.recipe_items.tolist()
     indicator = set((COORD.kinds == INDICATOR).nonzero()[0].tolist())
     for lit, cells in ((0, indicator), (5, indicator | set(COORD.buttons))):
-        first, second = (frame_of(recipe=recipe, buttons=(lit,)) for recipe in recipes)
+        first, second = (draw_scene(recipe=recipe, buttons=(lit,)) for recipe in recipes)
         assert changed_cells(first, second) == cells
         footer = COORD.height * CELL
         assert np.any(first[footer:] != second[footer:])
 
 
-def test_the_view_is_outlined_only_on_request():
+def test_view_of_the_ego_is_outlined_only_on_request():
     layout = LAYOUTS["coord_ring"]
     record = state_record(layout, (4, 3, "up"), (1, 1, "up"))[0]
     with_view, without = (draw_frame(layout, record, cell=CELL, view=view).astype(int) for view in (True, False))
@@ -102,10 +102,10 @@ def test_the_view_is_outlined_only_on_request():
     assert (rows.min(), columns_.min()) == (1 * CELL, 2 * CELL)
     assert max(rows.max() - 6 * CELL, columns_.max() - 7 * CELL, key=abs) in (-1, 0)
     edge = with_view[CELL + 1, 2 * CELL : 7 * CELL]
-    assert share(edge, 2, (0, 1)) == 1 > share(without[CELL + 1, 2 * CELL : 7 * CELL], 2, (0, 1))
+    assert dominant_share(edge, 2, (0, 1)) == 1 > dominant_share(without[CELL + 1, 2 * CELL : 7 * CELL], 2, (0, 1))
 
 
-def test_an_episode_becomes_an_endless_gif_with_a_frame_a_step(tmp_path):
+def test_save_episode_writes_a_looping_gif_with_one_frame_per_step(tmp_path):
     records = np.repeat(state_record(COORD, (2, 2, "up"), (5, 2, "up")), 6, axis=0)
     records[3:, columns(COORD).hands] = DISH
     path = tmp_path / "episode.gif"
@@ -129,7 +129,7 @@ def test_an_episode_becomes_an_endless_gif_with_a_frame_a_step(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["episode.gif"]
 
 
-def test_wrong_input_is_refused_with_what_was_expected_and_found(tmp_path):
+def test_wrong_input_raises_error_with_expected_and_found_values(tmp_path):
     records = state_record(COORD, (2, 2, "up"), (5, 2, "up"))
     size, path = records.shape[-1], tmp_path / "episode.gif"
     off_the_floor = records[0].copy()

@@ -1,6 +1,6 @@
-"""Rules of the game in hand-drawn scenes; `test_rules_against_jaxmarl.py` compares all others.
+"""Test the game's rules in hand-drawn scenes; `test_rules_against_jaxmarl.py` compares random states.
 
-Most scenes are in cramped_up, where one room holds everything:
+Most scenes use the layout cramped_up, in which both agents can reach everything:
 
       01234
     0 WWPWW
@@ -39,24 +39,24 @@ AT_POT, AT_GOAL = (2, 1, "up"), (3, 2, "down")
 DELTA = {UP: (0, -1), DOWN: (0, 1), LEFT: (-1, 0), RIGHT: (1, 0)}
 
 
-class Seen(NamedTuple):
-    """One state in plain Python, and the rewards of the step that led to it."""
+class Scene(NamedTuple):
+    """State after a step as plain Python values, with the rewards of the step."""
 
     record: np.ndarray
     hands: list[int]
     recipe: int
     delivered: int
-    pots: list[tuple[int, int]]  # (content, timer)
+    pots: list[tuple[int, int]]  # content and timer of each pot
     buttons: list[int]
     reward: float
     shaped: list[float]
 
 
-def act(layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, next_recipe: int = RECIPE_111) -> Seen:
+def act(layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, next_recipe: int = RECIPE_111) -> Scene:
     """Return the scene after one step; a correct delivery changes the recipe to `next_recipe`."""
     after = rules.step(layout, record, np.array([[ego, teammate]]), np.array([next_recipe], np.uint8))
     state = unpack(layout, after.state)
-    return Seen(
+    return Scene(
         record=after.state,
         hands=state.hands[0].tolist(),
         recipe=int(state.recipe[0]),
@@ -73,36 +73,36 @@ def slot(request: pytest.FixtureRequest) -> int:
     return request.param
 
 
-def solo(slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Pose = ASIDE, **fields) -> np.ndarray:
-    """Return a scene with one agent at pose `at` holding an item, and the other out of the way."""
+def scene(slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Pose = ASIDE, **fields) -> np.ndarray:
+    """Return a state with one agent at pose `at` holding item `hand`, and the other agent out of the way."""
     if slot == 0:
         return state_record(layout, at, aside, hands=[hand, 0], **fields)
     return state_record(layout, aside, at, hands=[0, hand], **fields)
 
 
-def act_alone(
+def after_action(
     slot: int, record: np.ndarray, action: int, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111
-) -> Seen:
-    """Return the scene after one step in which the given agent acts and the other stays."""
+) -> Scene:
+    """Return the scene after one step in which agent `slot` acts and the other agent stays."""
     ego, teammate = (action, STAY) if slot == 0 else (STAY, action)
     return act(layout, record, ego, teammate, next_recipe)
 
 
-def interact(slot: int, record: np.ndarray, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111) -> Seen:
-    return act_alone(slot, record, INTERACT, layout, next_recipe)
+def interact(slot: int, record: np.ndarray, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111) -> Scene:
+    return after_action(slot, record, INTERACT, layout, next_recipe)
 
 
-# Moving
+# Tests of movement
 
 
-def test_action_ids_are_in_the_papers_order():
+def test_action_ids_follow_the_order_of_the_paper():
     assert ACTIONS == ("up", "down", "left", "right", "stay", "interact")
     assert (UP, DOWN, LEFT, RIGHT, STAY, INTERACT) == (0, 1, 2, 3, 4, 5)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_every_pair_of_cells_and_actions_moves_as_the_map_says(layout):
-    """Compare with steps 1 to 3 of the specification, written out cell by cell."""
+def test_agents_move_as_specified_from_every_pair_of_cells(layout):
+    """Compare with steps 1 to 3 of the specification, computed here for each cell."""
     cells, wanted_cells, actions = [], [], []
     starts = [pair for pair in product(*layout.rooms) if pair[0] != pair[1]]
     for old, pair in product(starts, product(range(6), repeat=2)):
@@ -126,15 +126,15 @@ def test_every_pair_of_cells_and_actions_moves_as_the_map_says(layout):
     np.testing.assert_array_equal(after.facings, np.where(turned >= 0, turned, facings))
 
 
-# Pots
+# Tests of pots
 
 
-def test_a_pot_takes_three_and_cooks_by_itself_for_20_steps(slot):
-    record = solo(slot, AT_POT, ZERO)
+def test_pot_with_three_ingredients_cooks_for_20_steps(slot):
+    record = scene(slot, AT_POT, ZERO)
     for content in (ZERO, 2 * ZERO):
         after = interact(slot, record)
         assert (after.pots, after.hands) == ([(content, 0)], [0, 0])
-        assert act(CRAMPED, after.record, STAY).pots == [(content, 0)]  # two do not cook
+        assert act(CRAMPED, after.record, STAY).pots == [(content, 0)]  # two ingredients do not start cooking
         record = after.record.copy()
         record[:, columns(CRAMPED).hands.start + slot] = ZERO
     after = interact(slot, record)
@@ -146,39 +146,39 @@ def test_a_pot_takes_three_and_cooks_by_itself_for_20_steps(slot):
     assert timeline == [*cooking, (SOUP_000, 0, 0), (SOUP_000, 0, 0)]
 
 
-# Deliveries
+# Tests of deliveries
 
 
 @pytest.mark.parametrize("next_recipe", [RECIPE_000, RECIPE_111])
 def test_a_correct_delivery_pays_20_and_changes_the_recipe(slot, next_recipe):
-    after = interact(slot, solo(slot, AT_GOAL, DISH_000, recipe=RECIPE_000), next_recipe=next_recipe)
+    after = interact(slot, scene(slot, AT_GOAL, DISH_000, recipe=RECIPE_000), next_recipe=next_recipe)
     assert (after.reward, after.shaped, after.hands) == (20, [0, 0], [0, 0])
-    assert (after.recipe, after.delivered) == (next_recipe, 1)  # the next recipe may be the same
+    assert (after.recipe, after.delivered) == (next_recipe, 1)  # the next recipe may equal the delivered recipe
     later = act(CRAMPED, after.record, STAY, next_recipe=RECIPE_001)
     assert (later.delivered, later.recipe, later.reward) == (0, next_recipe, 0)
 
 
 @pytest.mark.parametrize(("recipe", "dish"), [(RECIPE_000, DISH_111), (RECIPE_111, DISH_000), (RECIPE_000, DISH_001)])
-def test_a_wrong_delivery_costs_20_and_the_recipe_stays(slot, recipe, dish):
-    after = interact(slot, solo(slot, AT_GOAL, dish, recipe=recipe), next_recipe=RECIPE_001)
+def test_a_wrong_delivery_costs_20_and_keeps_the_recipe(slot, recipe, dish):
+    after = interact(slot, scene(slot, AT_GOAL, dish, recipe=recipe), next_recipe=RECIPE_001)
     assert (after.reward, after.shaped, after.hands) == (-20, [0, 0], [0, 0])
     assert (after.recipe, after.delivered) == (recipe, 0)
 
 
-# Button. In coord_ring the first button is at (4, 2), between the ego's ring and the teammate's room
+# Tests of buttons: in coord_ring, both agents can reach the first button, at (4, 2)
 
 AT_BUTTON = ((4, 1, "down"), (4, 3, "up"))
 FAR = ((1, 4, "up"), (3, 5, "up"))
 
 
-def ring(slot: int, hand: int = 0, **fields) -> np.ndarray:
-    return solo(slot, AT_BUTTON[slot], hand, layout=RING, aside=FAR[1 - slot], **fields)
+def ring_scene(slot: int, hand: int = 0, **fields) -> np.ndarray:
+    return scene(slot, AT_BUTTON[slot], hand, layout=RING, aside=FAR[1 - slot], **fields)
 
 
-def test_a_press_costs_5_and_lights_one_button_for_9_observations(slot):
-    record = ring(slot, recipe=RECIPE_000)
+def test_button_press_costs_5_and_shows_the_recipe_for_9_observations(slot):
+    record = ring_scene(slot, recipe=RECIPE_000)
     row = 3 if slot == 0 else 1
-    recipe_channel = 2 * 10 + 6 + 3 + 5 + 2  # count of ingredient 0 in the recipe, n = 3
+    recipe_channel = 2 * 10 + 6 + 3 + 5 + 2  # count of ingredient 0 in the recipe, with three ingredient types
     after = interact(slot, record, RING)
     assert (after.reward, after.shaped, after.hands) == (-5, [0, 0], [0, 0])
     timers, visible = [], []
@@ -191,7 +191,7 @@ def test_a_press_costs_5_and_lights_one_button_for_9_observations(slot):
     assert visible == [3] * 9 + [0, 0]
 
 
-# Agent 0 first: the counter (3, 2) of coord_ring, and the pot (4, 2) of asymm_both, are faced from both sides
+# Tests of the order of agents: both agents face the pot (4, 2) of asymm_both
 
 
 @pytest.mark.parametrize(
@@ -200,28 +200,29 @@ def test_a_press_costs_5_and_lights_one_button_for_9_observations(slot):
         ([ZERO, ONE], ZERO, [0, 0], (RECIPE_001, 19)),  # the teammate adds the third ingredient
         ([ZERO, ONE], 2 * ZERO, [0, ONE], (RECIPE_000, 19)),  # the teammate's ingredient would be the fourth
         ([PLATE, PLATE], SOUP_000, [DISH_000, PLATE], (0, 0)),
-        ([PLATE, ONE], SOUP_000, [DISH_000, 0], (ONE, 0)),  # the pot that the ego emptied takes an ingredient
+        # the ego empties the pot, then the teammate adds an ingredient
+        ([PLATE, ONE], SOUP_000, [DISH_000, 0], (ONE, 0)),
         ([ONE, PLATE], SOUP_000, [ONE, DISH_000], (0, 0)),
         ([ZERO, PLATE], 2 * ZERO, [0, PLATE], (RECIPE_000, 19)),
     ],
 )
-def test_agent_0_interacts_first_on_a_shared_pot(hands, pot, hands_after, pot_after):
+def test_ego_interacts_before_the_teammate_at_a_shared_pot(hands, pot, hands_after, pot_after):
     record = state_record(ASYMM, (3, 2, "right"), (5, 2, "left"), hands=hands, pot_items=[pot, 0])
     after = act(ASYMM, record, INTERACT, INTERACT)
     assert (after.hands, after.pots) == (hands_after, [pot_after, (0, 0)])
 
 
-# Shaped rewards: each agent's own, apart from the team's
+# Tests of shaped rewards, which each agent gets in addition to the team reward
 
 
-def own(slot: int, value: float) -> list[float]:
+def reward_of_slot(slot: int, value: float) -> list[float]:
     return [value, 0] if slot == 0 else [0, value]
 
 
-# Plates in asymm_both: two pots, (4, 2) and (4, 3); piles of plates at (3, 4) and (5, 4)
+# asymm_both has pots at (4, 2) and (4, 3), and piles of plates at (3, 4) and (5, 4)
 
 AT_PLATES_ASYMM = ((3, 3, "down"), (5, 3, "down"))
-AWAY = ((2, 3, "down"), (6, 3, "down"))  # before the counters (2, 4) and (6, 4)
+AWAY = ((2, 3, "down"), (6, 3, "down"))  # the agents face the counters (2, 4) and (6, 4)
 
 
 @pytest.mark.parametrize(
@@ -230,7 +231,7 @@ AWAY = ((2, 3, "down"), (6, 3, "down"))  # before the counters (2, 4) and (6, 4)
         ([0, 0], 0, {}, 0),  # no pot in use
         ([ZERO, 0], 0, {}, 3),
         ([0, SOUP_111], 0, {}, 3),
-        ([ZERO, 0], PLATE, {}, 0),  # as many plates in hands as pots in use
+        ([ZERO, 0], PLATE, {}, 0),  # hands hold as many plates as pots are in use
         ([ZERO, ONE], PLATE, {}, 3),
         ([ZERO, 0], DISH_000, {}, 3),  # a dish does not count as a plate
         ([ZERO, 0], 0, {(1, 4): PLATE}, 0),
@@ -238,10 +239,10 @@ AWAY = ((2, 3, "down"), (6, 3, "down"))  # before the counters (2, 4) and (6, 4)
         ([ZERO, 0], 0, {(1, 4): ZERO, (6, 4): DISH_000}, 3),  # other items do not count as plates
     ],
 )
-def test_taking_a_plate_pays_3_if_it_is_needed(slot, pots, other_hand, counters, reward):
+def test_taking_a_plate_earns_a_shaped_reward_of_3_if_a_pot_needs_a_plate(slot, pots, other_hand, counters, reward):
     poses, hands = list(AWAY), [other_hand, other_hand]
     poses[slot], hands[slot] = AT_PLATES_ASYMM[slot], 0
     record = state_record(ASYMM, poses[0], poses[1], hands=hands, pot_items=pots, counters=counters)
     after = interact(slot, record, ASYMM)
     assert (after.hands[slot], after.reward) == (PLATE, 0)
-    assert after.shaped == own(slot, reward)
+    assert after.shaped == reward_of_slot(slot, reward)

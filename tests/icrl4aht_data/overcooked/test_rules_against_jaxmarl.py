@@ -1,4 +1,4 @@
-"""Differential test: equal steps, rewards and observations as JaxMARL from equal states."""
+"""Differential test: steps, rewards and observations equal those of JaxMARL from equal states."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from icrl4aht_data.overcooked.state import columns
 from tests.helpers.jaxmarl_peer import TO_PEER_ACTION, from_peer_state, peer_step, to_peer_state
 from tests.helpers.states import random_records
 
-BATCH, STEPS, SCENES = 512, 20, 20  # trajectories: 10,240 steps; single steps from random states: 10,240
+BATCH, STEPS, SCENES = 512, 20, 20  # 10,240 steps of trajectories, then 10,240 single steps from random states
 
 
-DEFAULT = ("coord_ring",)  # with buttons; the others are slow
+DEFAULT = ("coord_ring",)  # this layout has buttons; all other layouts are slow tests
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Words of visible cells are what `observe` shows."""
+"""Test that the words of visible cells stand for the channels that `observe` returns."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from tests.helpers.states import random_records
 each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 
 
-def records_of(layout: Layout) -> np.ndarray:
-    """Return records, uint8 (800, S), from play and drawn at random from all valid states."""
+def example_records(layout: Layout) -> np.ndarray:
+    """Return records, uint8 (800, S): half from random play, half drawn from all valid states."""
     rng = np.random.default_rng(5)
     return np.concatenate([random_history(layout, 4, 100, rng)["state"], random_records(layout, 400, rng)])
 
 
 @each_layout
 @pytest.mark.parametrize("agent", [0, 1])
-def test_channels_of_the_words_are_the_observation(layout, agent):
-    records, words = records_of(layout), cell_words([layout])
+def test_channels_of_words_equal_the_observation(layout, agent):
+    records, words = example_records(layout), cell_words([layout])
     expected = observe(layout, records, agent)
     ids = words.ids(records, agent=agent)
     assert ids.dtype == np.int32
@@ -35,8 +35,8 @@ def test_channels_of_the_words_are_the_observation(layout, agent):
 
 
 @each_layout
-def test_entries_that_can_differ_from_zero(layout):
-    records, words = records_of(layout), cell_words([layout])
+def test_entries_include_all_nonzero_values_of_observations(layout):
+    records, words = example_records(layout), cell_words([layout])
     seen = [np.flatnonzero(observe(layout, records, agent).reshape(len(records), -1).any(axis=0)) for agent in (0, 1)]
     assert np.isin(seen[0], words.entries((0,))).all()
     assert np.isin(seen[1], words.entries((1,))).all()
@@ -46,25 +46,25 @@ def test_entries_that_can_differ_from_zero(layout):
 
 
 @pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
-def test_records_of_several_layouts_in_one_batch(xp):
+def test_words_of_several_layouts_in_one_batch_equal_observations(xp):
     layouts = [get_layout(name) for name in ("asymm_both", "cramped_up", "asymm_right", "cramped_down")]
     words, number = cell_words(layouts), np.array([2, 0, 3, 1, 1])
     mixed, expected = np.zeros((5, 6, 64), np.uint8), np.zeros((5, 6, *layouts[0].obs_shape), np.uint8)
     for row, layout in enumerate(layouts[n] for n in number):
-        records = records_of(layout)[: 6 * 7 : 7]
+        records = example_records(layout)[: 6 * 7 : 7]
         mixed[row, :, : records.shape[-1]], expected[row] = records, observe(layout, records, 0)
     size = max(np.flatnonzero(mixed.any(axis=(0, 1)))) + 1
     ids = words.ids(xp.asarray(mixed[..., :size]), xp.asarray(number))
     np.testing.assert_array_equal(words.channels[np.asarray(ids)].reshape(expected.shape), expected)
 
 
-def test_records_of_all_layouts_in_one_batch_with_canonical_channels():
+def test_words_of_all_layouts_equal_canonical_observations():
     layouts = list(LAYOUTS.values())
     words, size = cell_words(layouts, canonical=True), max(map(record_size, layouts))
     mixed = np.zeros((len(layouts), 40, size), np.uint8)
     expected = np.zeros((len(layouts), 40, 5, 5, 46), np.uint8)
     for row, layout in enumerate(layouts):
-        records = records_of(layout)[::20]
+        records = example_records(layout)[::20]
         mixed[row, :, : records.shape[-1]], expected[row] = records, observe(layout, records, 0, canonical=True)
     ids = words.ids(mixed, np.arange(len(layouts)))
     np.testing.assert_array_equal(words.channels[ids].reshape(expected.shape), expected)
@@ -76,7 +76,7 @@ def test_records_of_all_layouts_in_one_batch_with_canonical_channels():
 @pytest.mark.parametrize(("column", "value"), [("pot_timers", 31), ("pot_items", 255), ("hands", 255)])
 def test_impossible_contents_map_to_the_last_word(column, value):
     layout = get_layout("cramped_up")
-    records, words = records_of(layout), cell_words([layout])
+    records, words = example_records(layout), cell_words([layout])
     records[:, getattr(columns(layout), column)] = value
     ids = words.ids(records)
     impossible = len(words.channels) - 1

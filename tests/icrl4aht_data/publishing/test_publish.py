@@ -1,4 +1,4 @@
-"""Releases built for publication: files, card and machine-readable descriptions."""
+"""Test releases built for publication: files, card and machine-readable descriptions."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def release(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def published(release, tmp_path_factory) -> Path:
-    """Build the fixture `release` for publication (read-only)."""
+def published_release(release, tmp_path_factory) -> Path:
+    """Return the fixture `release`, built for publication (read-only)."""
     return build_release(release, tmp_path_factory.mktemp("published") / "release", published=DAY)
 
 
 @pytest.fixture(scope="session")
-def with_learned(tmp_path_factory) -> Path:
+def release_with_learned_teammate(tmp_path_factory) -> Path:
     """Return a release of one task with a learned teammate and its checkpoint (read-only)."""
     folder = tmp_path_factory.mktemp("learned")
     weights = folder / "policy.safetensors"
@@ -80,10 +80,10 @@ def front_matter(card: str) -> dict:
     return yaml.safe_load(card.split("---\n")[1])
 
 
-def test_it_contains_the_source_and_is_valid(release, published):
-    report = verify_release(published, level="deep")
+def test_published_release_is_valid_and_contains_the_source_files(release, published_release):
+    report = verify_release(published_release, level="deep")
     assert report.ok, report.findings
-    old, new = read_manifest(release), read_manifest(published)
+    old, new = read_manifest(release), read_manifest(published_release)
     assert {name for name in old if new[name] != old[name]} == {"README.md"}
     assert new.keys() - old.keys() == {
         "card.json",
@@ -100,10 +100,10 @@ def test_it_contains_the_source_and_is_valid(release, published):
         "index/cramped_up/train.parquet",
     }
     for name in ("LICENSE", "CITATION.cff"):
-        assert (published / name).read_bytes() == (ROOT / name).read_bytes()
+        assert (published_release / name).read_bytes() == (ROOT / name).read_bytes()
 
 
-def test_an_invalid_source_is_refused(damaged, tmp_path):
+def test_build_release_refuses_an_invalid_source(damaged, tmp_path):
     shard = next(damaged.rglob("*.h5"))
     shard.write_bytes(shard.read_bytes()[:-1] + b"?")
     with pytest.raises(ReleaseError, match=r"release: not valid: .*\.h5: sha256: expected .*; see `icrl4aht"):
@@ -114,41 +114,41 @@ def test_an_invalid_source_is_refused(damaged, tmp_path):
 
 
 def test_changes_during_copying_are_detected(damaged, tmp_path):
-    def change(what, done, total):
+    def change_copied_file(what, done, total):
         if what == "copying" and done == total:
             (tmp_path / ".out.partial/meta/provenance.json").write_text("{}")
 
     with pytest.raises(ReleaseError, match=r"provenance\.json: changed while it was copied, sha256 now"):
-        build_release(damaged, tmp_path / "out", advance=change)
+        build_release(damaged, tmp_path / "out", advance=change_copied_file)
     assert not (tmp_path / "out").exists()
 
 
-def test_datasets_loads_every_configuration(published, tmp_path):
+def test_hugging_face_datasets_loads_every_configuration(published_release, tmp_path):
     import datasets
 
-    names = datasets.get_dataset_config_names(str(published))
+    names = datasets.get_dataset_config_names(str(published_release))
     assert names == ["default", "coord_simple", "cramped_up", "cramped_down", "episodes"]
     found = {}
     for name in (None, "cramped_down"):
-        loaded: Any = datasets.load_dataset(str(published), name, cache_dir=str(tmp_path))
+        loaded: Any = datasets.load_dataset(str(published_release), name, cache_dir=str(tmp_path))
         found[name] = {split: sorted(rows["history_id"]) for split, rows in loaded.items()}
-    index = load_icrl4aht(published).index
+    index = load_icrl4aht(published_release).index
     assert found == {
         None: {split: index.query(split=split).tolist() for split in ("train", "test")},
         "cramped_down": {"test": index.query(split="test", layout="cramped_down").tolist()},
     }
 
 
-def test_croissant_is_valid_and_its_records_equal_the_index(published):
+def test_croissant_file_is_valid_and_its_records_equal_the_index(published_release):
     import mlcroissant
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # raised by dependencies of mlcroissant
-        described = mlcroissant.Dataset(str(published / "croissant.json"))
+        warnings.simplefilter("ignore")  # dependencies of mlcroissant raise warnings
+        described = mlcroissant.Dataset(str(published_release / "croissant.json"))
         records = list(described.records("histories"))
         episodes = list(described.records("episodes"))
     assert (described.metadata.ctx.issues.errors, described.metadata.ctx.issues.warnings) == (set(), set())
-    lines = read_lines(published / "meta/histories.jsonl")
+    lines = read_lines(published_release / "meta/histories.jsonl")
     assert len(records) == len(lines)
     for record in records:
         found = {name.removeprefix("histories/"): value for name, value in record.items()}
@@ -158,44 +158,44 @@ def test_croissant_is_valid_and_its_records_equal_the_index(published):
         line = lines[plain["history_id"]]
         assert plain.pop("h5_row") in (line.pop("h5_row"), None) or np.isnan(found["h5_row"])
         assert plain == {"label_view": None, "teammate_of_episode": None} | line
-    history = load_icrl4aht(published).history(int(episodes[0]["episodes/history_id"]))
+    history = load_icrl4aht(published_release).history(int(episodes[0]["episodes/history_id"]))
     np.testing.assert_array_equal(episodes[0]["episodes/actions"], history.episodes[0].actions)
     assert len(episodes) == 12 * 6
-    content = json.loads((published / "croissant.json").read_text())
+    content = json.loads((published_release / "croissant.json").read_text())
     assert content["datePublished"] == "2026-01-02"
     assert [text.rsplit("/", 1)[1] for text in content["conformsTo"]] == ["1.1", "1.0"]
     assert content["rai:personalSensitiveInformation"] == "None."
     assert content["rai:dataCollectionType"] == "Software Collection" and len(content["rai:dataUseCases"]) > 50
     hashed = {part["@id"]: part["sha256"] for part in content["distribution"] if "sha256" in part}
-    listed = read_manifest(published)
+    listed = read_manifest(published_release)
     assert hashed == {name: listed[name] for name in listed if name != "croissant.json"}
 
 
-def test_the_card_describes_the_release(published):
-    card = (published / "README.md").read_text()
+def test_the_card_describes_the_release(published_release):
+    card = (published_release / "README.md").read_text()
     facts = front_matter(card)
     assert facts["license"] == "mit"
     assert facts["task_categories"] == ["reinforcement-learning"]
     assert [config["config_name"] for config in facts["configs"] if config.get("default")] == ["default"]
     files = {name for config in facts["configs"] for name in config["data_files"] for name in [name["path"]]}
-    assert all(list(published.glob(pattern)) for pattern in files)
+    assert all(list(published_release.glob(pattern)) for pattern in files)
     assert "12 histories of 6 tasks, 1,440 transitions; each history has 120 steps." in card
     assert re.search(r"\| coord_simple \| train \| \S+ to \S+ \(4\) \|", card)
     assert "coord_simple/H4. `cards/headroom.md`" in card, "no cell of cramped_down"
     for name in re.findall(r"!\[.*?\]\((.*?)\)", card):
-        assert (published / name).read_bytes().startswith(b"\x89PNG"), name
+        assert (published_release / name).read_bytes().startswith(b"\x89PNG"), name
     assert len(re.findall(r"!\[", card)) == 2
 
 
-def test_the_cards_snippet_runs(published, monkeypatch):
-    snippets = re.findall(r"```python\n(.*?)```", (published / "README.md").read_text(), re.DOTALL)
+def test_code_snippets_of_the_card_run(published_release, monkeypatch):
+    snippets = re.findall(r"```python\n(.*?)```", (published_release / "README.md").read_text(), re.DOTALL)
     assert len(snippets) == 2
     for snippet in snippets:
-        exec(snippet.replace("path/of/this/folder", str(published)), {})
+        exec(snippet.replace("path/of/this/folder", str(published_release)), {})
 
 
-def test_releases_with_learned_teammates_are_built(with_learned, tmp_path):
-    out = build_release(with_learned, tmp_path / "out")
+def test_build_release_accepts_learned_teammates(release_with_learned_teammate, tmp_path):
+    out = build_release(release_with_learned_teammate, tmp_path / "out")
     report = verify_release(out, level="deep")
     assert report.ok and not report.notes, report
     card = (out / "README.md").read_text()
@@ -204,7 +204,7 @@ def test_releases_with_learned_teammates_are_built(with_learned, tmp_path):
     assert verify_release(build_release(out, tmp_path / "again")).ok
 
 
-def test_releases_of_observations_are_built(release, tmp_path):
+def test_build_release_accepts_releases_of_observations(release, tmp_path):
     source = to_release(load_icrl4aht(release), tmp_path / "source", "observations")
     out = build_release(source, tmp_path / "out")
     assert verify_release(out).ok
@@ -216,7 +216,7 @@ def test_releases_of_observations_are_built(release, tmp_path):
     assert "`state`" not in card
 
 
-def test_the_command_builds(release, tmp_path):
+def test_release_build_command_prints_the_built_files(release, tmp_path):
     out = tmp_path / "out"
     printed = run_cli("release", "build", "--json", release, "--out", out)
     summary = json.loads(printed)

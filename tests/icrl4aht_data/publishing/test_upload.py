@@ -1,4 +1,4 @@
-"""Uploads: complete, resumable, and tagged only if the repository equals the release."""
+"""Test uploads: complete, resumable, and tagged only if the repository equals the release."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ REPO, ADDRESS = "us/histories", "hf://datasets/us/histories"
 
 
 @pytest.fixture(scope="module")
-def published(tmp_path_factory) -> Path:
+def published_release(tmp_path_factory) -> Path:
     """Return a release built for publication (read-only)."""
     root = tmp_path_factory.mktemp("upload")
     random_release(root / "source", streams=2)
@@ -44,7 +44,7 @@ def hub(tmp_path):
 
 
 def next_version(release: Path, target: Path) -> Path:
-    """Return the release with another data version and one file less."""
+    """Copy a release, change its data version and remove one file."""
     shutil.copytree(release, target)
     info = target / "meta/info.json"
     info.write_text(info.read_text().replace('"data_version": "0.0.1"', '"data_version": "0.1.0"'))
@@ -53,31 +53,31 @@ def next_version(release: Path, target: Path) -> Path:
     return target
 
 
-def sent(hub: Hub) -> list[str]:
-    """Return the large files that were uploaded completely."""
+def uploaded_files(hub: Hub) -> list[str]:
+    """Return the paths of the large files that were uploaded completely."""
     return [request.path for request in hub.log if request.method == "PUT" and request.status == 200]
 
 
-def test_dry_run_uploads_nothing(hub, published):
-    printed = run_cli("upload", published, ADDRESS, "--dry-run", "--private")
+def test_dry_run_uploads_nothing(hub, published_release):
+    printed = run_cli("upload", published_release, ADDRESS, "--dry-run", "--private")
     *files, last = printed.splitlines()
-    assert len(files) == len(read_manifest(published)) + 1
+    assert len(files) == len(read_manifest(published_release)) + 1
     for line in files:
         size, name = line.split()
-        assert int(size.replace(",", "")) == (published / name).stat().st_size
+        assert int(size.replace(",", "")) == (published_release / name).stat().st_size
     assert last.endswith(f"to the new private dataset repository {REPO}, and tag them v0.0.1")
     assert not hub.repos
     assert {request.method for request in hub.log} == {"GET"}
 
 
-def test_an_upload_is_complete_and_tagged(hub, published, tmp_path):
-    done = upload_release(published, ADDRESS, private=True)
+def test_an_upload_is_complete_and_tagged(hub, published_release, tmp_path):
+    done = upload_release(published_release, ADDRESS, private=True)
     assert (done.done, done.creates, done.tag, done.deletes) == ("uploaded", True, "v0.0.1", [])
     assert hub.repo(REPO).tags == {"v0.0.1": done.commit}
     assert hub.repo(REPO).private
     there = hub.files(REPO, "v0.0.1")
     del there[".gitattributes"]
-    assert there == {name: (published / name).read_bytes() for name in done.files}
+    assert there == {name: (published_release / name).read_bytes() for name in done.files}
     copy = snapshot_download(
         REPO, repo_type="dataset", revision="v0.0.1", local_dir=tmp_path / "copy", ignore_patterns=".gitattributes"
     )
@@ -85,17 +85,17 @@ def test_an_upload_is_complete_and_tagged(hub, published, tmp_path):
     assert verify_release(copy).ok
 
 
-def test_a_second_upload_sends_nothing(hub, published):
-    first = upload_release(published, ADDRESS)
+def test_a_second_upload_sends_nothing(hub, published_release):
+    first = upload_release(published_release, ADDRESS)
     hub.log.clear()
-    printed = run_cli("upload", published, ADDRESS)
+    printed = run_cli("upload", published_release, ADDRESS)
     assert f"already there, {len(first.files)} files" in printed
     assert f"tag v0.0.1 is commit {first.commit}" in printed
     assert {request.method for request in hub.log} == {"GET"}
 
 
-def test_a_tag_does_not_move(hub, published, tmp_path):
-    first = upload_release(published, ADDRESS)
+def test_upload_of_other_content_for_an_existing_tag_is_refused(hub, published_release, tmp_path):
+    first = upload_release(published_release, ADDRESS)
     random_release(tmp_path / "source", streams=2, seed=1)
     other = build_release(tmp_path / "source", tmp_path / "other")
     with pytest.raises(UploadError, match=r"us/histories: tag v0\.0\.1 exists with other content: .*another"):
@@ -103,34 +103,34 @@ def test_a_tag_does_not_move(hub, published, tmp_path):
     assert hub.repo(REPO).tags == {"v0.0.1": first.commit}
 
 
-def test_the_next_version_replaces_the_last(hub, published, tmp_path):
-    first = upload_release(published, ADDRESS)
-    new = next_version(published, tmp_path / "new")
+def test_upload_of_a_new_version_replaces_the_old_files(hub, published_release, tmp_path):
+    first = upload_release(published_release, ADDRESS)
+    new = next_version(published_release, tmp_path / "new")
     looked = upload_release(new, ADDRESS, dry_run=True)
     assert looked.deletes == ["figures/layouts.png"]
     assert any("would delete  figures/layouts.png" in line for line in looked.report_lines())
-    before = sent(hub)
+    before = uploaded_files(hub)
     second = upload_release(new, ADDRESS)
-    assert sent(hub) == before, "large files that were there are not sent again"
+    assert uploaded_files(hub) == before, "large files that were there are not sent again"
     assert hub.repo(REPO).tags == {"v0.0.1": first.commit, "v0.1.0": second.commit}
     assert "figures/layouts.png" not in hub.files(REPO)
     assert "figures/layouts.png" in hub.files(REPO, "v0.0.1")
 
 
-def test_repositories_with_foreign_files_are_refused(hub, published, tmp_path):
+def test_repositories_with_foreign_files_are_refused(hub, published_release, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("years")
     hub.add_repo(REPO, tmp_path / "mine")
     for dry_run in (True, False):
         with pytest.raises(UploadError, match=r"has 1 files that belong to no release, such as thesis\.txt"):
-            upload_release(published, ADDRESS, dry_run=dry_run)
+            upload_release(published_release, ADDRESS, dry_run=dry_run)
     assert hub.files(REPO) == {"thesis.txt": b"years"}
 
 
-def test_a_public_repository_is_refused_for_a_private_upload(hub, published, tmp_path):
-    upload_release(published, ADDRESS)
+def test_a_public_repository_is_refused_for_a_private_upload(hub, published_release, tmp_path):
+    upload_release(published_release, ADDRESS)
     with pytest.raises(UploadError, match="us/histories: is a public repository; make it private"):
-        upload_release(next_version(published, tmp_path / "new"), ADDRESS, private=True)
+        upload_release(next_version(published_release, tmp_path / "new"), ADDRESS, private=True)
 
 
 def test_an_invalid_release_is_not_uploaded(hub, damaged):
@@ -141,37 +141,37 @@ def test_an_invalid_release_is_not_uploaded(hub, damaged):
 
 
 @pytest.mark.parametrize("address", ["us/histories", "hf://us/histories", "hf://datasets/us", f"{ADDRESS}@v1"])
-def test_other_addresses_are_refused(published, address):
+def test_invalid_upload_addresses_are_refused(published_release, address):
     with pytest.raises(OptionError, match=r"expected hf://datasets/ORG/REPO"):
-        upload_release(published, address)
+        upload_release(published_release, address)
 
 
 @pytest.mark.slow
-def test_a_killed_upload_resumes(hub, published):
-    """Completely uploaded files are not uploaded again."""
+def test_a_killed_upload_resumes(hub, published_release):
+    """Kill an upload and repeat the command: completely uploaded files are not sent again."""
     puts = 0
 
-    def rule(request: Request) -> Slow | None:
+    def fault_rule(request: Request) -> Slow | None:
         nonlocal puts
         puts += request.method == "PUT"
         return Slow(60) if request.method == "PUT" and puts > 3 else None
 
-    hub.faults.add(rule)
-    command = [sys.executable, "-m", "icrl4aht_data", "upload", str(published), ADDRESS]
+    hub.faults.add(fault_rule)
+    command = [sys.executable, "-m", "icrl4aht_data", "upload", str(published_release), ADDRESS]
     process = subprocess.Popen(command, env=hub.environment | {"PATH": ""}, cwd=ROOT)
     deadline = time.monotonic() + 60
-    while (len(sent(hub)) < 3 or puts < 4) and time.monotonic() < deadline:
+    while (len(uploaded_files(hub)) < 3 or puts < 4) and time.monotonic() < deadline:
         time.sleep(0.01)
     process.kill()
     process.wait()
-    first = sent(hub)
+    first = uploaded_files(hub)
     assert len(first) == 3
     assert not hub.repo(REPO).tags
     hub.faults.clear()
     second = subprocess.run(command, env=hub.environment | {"PATH": ""}, cwd=ROOT, capture_output=True, text=True)
     assert (second.returncode, second.stderr) == (0, ""), "silent where output is no terminal"
     assert ": uploaded, " in second.stdout
-    again = sent(hub)[3:]
+    again = uploaded_files(hub)[3:]
     assert again and not set(first) & set(again)
     assert set(hub.repo(REPO).tags) == {"v0.0.1"}
 
@@ -186,45 +186,50 @@ def test_a_killed_upload_resumes(hub, published):
         ("*/tag/*", "POST", 500, r"files sent so far are kept"),
     ],
 )
-def test_server_errors_are_wrapped_and_the_same_command_resumes(hub, published, path, method, status, message):
+def test_server_errors_are_reported_and_repeating_the_upload_succeeds(
+    hub, published_release, path, method, status, message
+):
     hub.faults.next(Status(status), times=9, path=path, method=method)
     with pytest.raises(UploadError, match=rf"^us/histories at http://127\.0\.0\.1:\d+: .*{status}.*; .*{message}"):
-        upload_release(published, ADDRESS)
+        upload_release(published_release, ADDRESS)
     assert not hub.repos or not hub.repo(REPO).tags
     hub.faults.clear()
-    assert upload_release(published, ADDRESS).done == "uploaded"
+    assert upload_release(published_release, ADDRESS).done == "uploaded"
 
 
-def test_an_unreachable_hub(published, tmp_path):
+def test_unreachable_hub_raises_upload_error(published_release, tmp_path):
     with hub_server(tmp_path / "hub") as hub:
         hub.close()
         for dry_run in (True, False):
             with pytest.raises(UploadError, match=r"us/histories at http://.*; nothing was sent: run the same"):
-                upload_release(published, ADDRESS, dry_run=dry_run)
+                upload_release(published_release, ADDRESS, dry_run=dry_run)
 
 
-def test_a_changed_repository_gets_no_tag(hub, published, tmp_path):
-    """Another user commits during the upload."""
-    shutil.copytree(published, tmp_path / "theirs")
+def test_repository_changed_during_the_upload_gets_no_tag(hub, published_release, tmp_path):
+    """Let another user commit to the repository during the upload."""
+    shutil.copytree(published_release, tmp_path / "theirs")
     (tmp_path / "theirs/LICENSE").write_text("all rights reserved")
     next(tmp_path.glob("theirs/data/*/*/*.h5")).write_bytes(b"no data")
     (tmp_path / "theirs/CITATION.cff").unlink()
     (tmp_path / "theirs/more.txt").write_text("")
 
-    def rule(request: Request) -> None:
+    def fault_rule(request: Request) -> None:
         if request.method == "GET" and request.path == f"/api/datasets/{REPO}":
             hub.add_repo(REPO, tmp_path / "theirs")
 
-    hub.faults.add(rule)
+    hub.faults.add(fault_rule)
     with pytest.raises(UploadError, match=r"differs from the release: more\.txt: not in the .*CITATION\.cff: missing"):
-        upload_release(published, ADDRESS)
+        upload_release(published_release, ADDRESS)
     assert not hub.repo(REPO).tags
     hub.faults.clear()
     with pytest.raises(UploadError, match=r"belong to no release, such as more\.txt"):
-        upload_release(published, ADDRESS)
+        upload_release(published_release, ADDRESS)
 
 
-def test_the_hubs_library_reads_the_metadata_of_cards(published):
-    assert DatasetCard.load(published / "README.md", ignore_metadata_errors=False).data.to_dict()["license"] == "mit"
+def test_huggingface_hub_reads_the_metadata_of_cards(published_release):
+    assert (
+        DatasetCard.load(published_release / "README.md", ignore_metadata_errors=False).data.to_dict()["license"]
+        == "mit"
+    )
     names = re.findall(r"\$([a-z_]+)", card_file("baseline.md").read_text())
     assert ModelCard(fill_template("baseline.md", **dict.fromkeys(names, "name") | {"datasets": ""})).data.to_dict()

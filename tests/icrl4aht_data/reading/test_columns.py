@@ -1,4 +1,4 @@
-"""Columns of the index, data frames, and filters by expert return."""
+"""Test columns of the index, data frames, filters by expert return, and warnings about weak labels."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from icrl4aht_data.format.schema import ENTRY_HINTS
 from tests.helpers.random_releases import random_release
 
 
-def expert(greedy: float | None, sampled: float | None = None, view: LabelView | None = "ego") -> ExpertLabels:
+def expert_labels(greedy: float | None, sampled: float | None = None, view: LabelView | None = "ego") -> ExpertLabels:
     sha256, returns = "0" * 64, {"return_greedy": greedy, "return_sampled": sampled}
     return ExpertLabels(sha256, "greedy", step=1000, episodes=200, view=view, **returns)
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory):
-    """Return four tasks with expert returns 9.5, 0.0 (16.9 sampled), -30.0 and unknown."""
+def expert_release(tmp_path_factory):
+    """Return a release of four tasks with expert returns 9.5, 0.0 (16.9 sampled), -30.0 and unknown."""
     root = tmp_path_factory.mktemp("measured") / "release"
-    experts = [expert(9.5, 10.0), expert(0.0, 16.9), expert(-30.0, 1.0, "state"), None]
+    experts = [expert_labels(9.5, 10.0), expert_labels(0.0, 16.9), expert_labels(-30.0, 1.0, "state"), None]
     random_release(root, streams=2, experts=experts, sources=["ppo", "ppo", "search", "search"], swap=4)
     return root
 
 
-def test_every_column_agrees_with_the_entries(measured):
-    dataset = load_icrl4aht(measured).select([7, 0, 3])
+def test_index_columns_equal_the_fields_of_entries(expert_release):
+    dataset = load_icrl4aht(expert_release).select([7, 0, 3])
     for name in ENTRY_HINTS:
         found = dataset.column(name).tolist()
         for value, entry in zip(found, dataset.entries, strict=True):
@@ -52,13 +52,13 @@ def test_every_column_agrees_with_the_entries(measured):
 
 
 @pytest.mark.parametrize(("name", "nearest"), [("layot", "layout"), ("return", "return_end")])
-def test_an_unknown_column_names_the_nearest(lite, name, nearest):
+def test_unknown_column_raises_error_with_the_nearest_name(lite, name, nearest):
     with pytest.raises(UnknownNameError, match=rf"unknown column '{name}'; valid: history_id, .* mean '{nearest}'"):
         load_icrl4aht(lite[0]).column(name)
 
 
-def test_data_frame(measured):
-    dataset = load_icrl4aht(measured, layout=["demo_wide", "coord_simple"]).select([7, 0, 3])
+def test_to_pandas_returns_one_row_per_history(expert_release):
+    dataset = load_icrl4aht(expert_release, layout=["demo_wide", "coord_simple"]).select([7, 0, 3])
     frame = dataset.to_pandas()
     assert list(frame.columns) == list(ENTRY_HINTS)
     assert len(frame) == 3
@@ -73,58 +73,58 @@ def test_data_frame(measured):
     assert frame.obs_shape.tolist() == [entry.obs_shape for entry in dataset.entries]
 
 
-def test_filters_of_sources_and_algorithms(measured):
-    assert load_icrl4aht(measured, source="search").ids.tolist() == [4, 5, 6, 7]
-    both = load_icrl4aht(measured).filter(source=["ppo", "search"], algorithm="utility_greedy")
+def test_source_and_algorithm_filters_select_histories(expert_release):
+    assert load_icrl4aht(expert_release, source="search").ids.tolist() == [4, 5, 6, 7]
+    both = load_icrl4aht(expert_release).filter(source=["ppo", "search"], algorithm="utility_greedy")
     assert both.ids.tolist() == [*range(8)]
     with pytest.raises(UnknownNameError, match=r"unknown source 'sac'; valid: ppo, noise, agent, search"):
-        load_icrl4aht(measured, source="sac")
+        load_icrl4aht(expert_release, source="sac")
     with pytest.raises(UnknownNameError, match=r"unknown algorithm 'utility'; .* mean 'utility_greedy'"):
-        load_icrl4aht(measured, algorithm="utility")
+        load_icrl4aht(expert_release, algorithm="utility")
     with pytest.raises(UnknownNameError, match=r"unknown filter 'algoritm'; .* mean 'algorithm'"):
-        load_icrl4aht(measured).filter(algoritm="utility")
+        load_icrl4aht(expert_release).filter(algoritm="utility")
     with pytest.raises(EmptySelectionError, match=r"'coord_simple', source='search'\..*; source ppo, search$"):
-        load_icrl4aht(measured, layout="coord_simple", source="search")
+        load_icrl4aht(expert_release, layout="coord_simple", source="search")
 
 
-def test_filter_by_the_view_of_the_labels(measured, lite):
-    assert load_icrl4aht(measured, label_view="ego").ids.tolist() == [0, 1, 2, 3]
-    assert load_icrl4aht(measured).filter(label_view=["state", "ego"]).ids.tolist() == [*range(6)]
-    assert load_icrl4aht(measured).counts("label_view") == {"ego": 4, "state": 2}
+def test_label_view_filter_selects_histories(expert_release, lite):
+    assert load_icrl4aht(expert_release, label_view="ego").ids.tolist() == [0, 1, 2, 3]
+    assert load_icrl4aht(expert_release).filter(label_view=["state", "ego"]).ids.tolist() == [*range(6)]
+    assert load_icrl4aht(expert_release).counts("label_view") == {"ego": 4, "state": 2}
     with pytest.raises(UnknownNameError, match=r"unknown label_view 'states'; valid: ego, state"):
-        load_icrl4aht(measured, label_view="states")
+        load_icrl4aht(expert_release, label_view="states")
     assert load_icrl4aht(lite[0]).counts("label_view") == {}
     with pytest.raises(EmptySelectionError, match=r"label_view='ego'.*label_view not recorded$"):
         load_icrl4aht(lite[0], label_view="ego")
 
 
-def test_other_sources_are_read_and_selected(tmp_path):
-    """Releases made before it was renamed have the source `student`."""
+def test_releases_with_old_source_names_are_read_and_filtered(tmp_path):
+    """Older releases have the source `student`, a name that new releases no longer use."""
     random_release(tmp_path / "release", streams=1, sources=["student", "noise", "agent", "search"])
     assert load_icrl4aht(tmp_path / "release", source="student").ids.tolist() == [0]
 
 
-def test_filter_by_expert_return(measured):
-    dataset = load_icrl4aht(measured, source="ppo", min_expert_return=9.5)
+def test_min_expert_return_filter_selects_histories(expert_release):
+    dataset = load_icrl4aht(expert_release, source="ppo", min_expert_return=9.5)
     assert dataset.ids.tolist() == [0, 1]
-    assert load_icrl4aht(measured).select([2, 1]).filter(min_expert_return=-1).ids.tolist() == [2, 1]
+    assert load_icrl4aht(expert_release).select([2, 1]).filter(min_expert_return=-1).ids.tolist() == [2, 1]
     with pytest.raises(EmptySelectionError, match=r"expert_return >= 10; highest: 9\.5"):
-        load_icrl4aht(measured, source="ppo", min_expert_return=10)
+        load_icrl4aht(expert_release, source="ppo", min_expert_return=10)
     with pytest.raises(NotStoredError, match=r"2 of 8 histories; leave these histories out by ds\.select"):
-        load_icrl4aht(measured, min_expert_return=0)
-    known = load_icrl4aht(measured)
+        load_icrl4aht(expert_release, min_expert_return=0)
+    known = load_icrl4aht(expert_release)
     known = known.select(known.ids[~np.isnan(known.column("expert_return"))])
     assert known.filter(min_expert_return=0).ids.tolist() == [0, 1, 2, 3]
     for wrong in ("1", True, float("nan")):
         with pytest.raises(OptionError, match="min_expert_return = "):
-            load_icrl4aht(measured, min_expert_return=wrong)  # type: ignore[arg-type]
+            load_icrl4aht(expert_release, min_expert_return=wrong)  # type: ignore[arg-type]
 
 
 class TestWeakLabels:
-    """Random play earns slightly less than 0 in all tasks."""
+    """The histories are random play, which earns slightly less than 0 in all tasks."""
 
-    def test_warning_names_tasks_and_numbers(self, measured):
-        dataset = load_icrl4aht(measured, layout="demo_wide")
+    def test_weak_labels_warning_names_tasks_and_returns(self, expert_release):
+        dataset = load_icrl4aht(expert_release, layout="demo_wide")
         with pytest.warns(WeakLabelsWarning) as caught:
             dataset.dpt(batch_size=2, context=5)
         (warning,) = caught
@@ -135,8 +135,10 @@ class TestWeakLabels:
         assert warning.filename == __file__
 
     @pytest.mark.parametrize(("ends", "weak"), [([20.0, 18.2], True), ([20.0, 17.0], False), ([-4.0, -1.0], False)])
-    def test_less_than_half_of_the_mean_of_the_ends(self, measured, monkeypatch, ends, weak):
-        dataset = load_icrl4aht(measured).select([0, 1])
+    def test_warning_appears_if_labels_earn_less_than_half_of_the_histories(
+        self, expert_release, monkeypatch, ends, weak
+    ):
+        dataset = load_icrl4aht(expert_release).select([0, 1])
         column = type(dataset).column
         monkeypatch.setattr(
             type(dataset), "column", lambda self, name: np.array(ends) if name == "return_end" else column(self, name)
@@ -144,4 +146,5 @@ class TestWeakLabels:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             dataset.dpt(batch_size=2, context=5)
-        assert [one.category for one in caught] == [WeakLabelsWarning] * weak  # labels earn 9.5
+        # the labels earn 9.5
+        assert [one.category for one in caught] == [WeakLabelsWarning] * weak

@@ -1,4 +1,4 @@
-"""Loading, selecting, changing options, and fields of histories."""
+"""Test loading and selecting histories, changing options, and reading fields."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from tests.helpers.batches import assert_equal
     ],
     ids=str,
 )
-def test_filters(lite, wanted, ids):
+def test_filter_and_load_select_the_same_histories(lite, wanted, ids):
     dataset = load_icrl4aht(lite[0])
     assert dataset.filter(**wanted).ids.tolist() == load_icrl4aht(lite[0], **wanted).ids.tolist() == list(ids)
 
 
-def test_selections_of_a_selection(lite):
+def test_selections_can_be_filtered_and_selected_again(lite):
     dataset = load_icrl4aht(lite[0])
     task = dataset.entries[4].task_id
     assert [e.task_id for e in dataset.filter(task_id=task, teammate_family="H4").entries] == [task] * 3
@@ -42,7 +42,7 @@ def test_selections_of_a_selection(lite):
         wide.select([7, 0])
 
 
-def test_histories_are_selected_by_a_mask(lite):
+def test_boolean_mask_selects_histories(lite):
     dataset = load_icrl4aht(lite[0])
     mask = dataset.column("layout") == "demo_wide"
     assert dataset.select(mask).ids.tolist() == dataset.ids[mask].tolist()
@@ -56,12 +56,12 @@ def test_histories_are_selected_by_a_mask(lite):
 
 
 @pytest.mark.parametrize("wanted", [{"algorithm": 3}, {"layout": 3}, {"split": [None]}])
-def test_filters_want_names(wanted):
+def test_filter_values_that_are_not_names_raise_errors(wanted):
     with pytest.raises(UnknownNameError, match=r"unknown (algorithm|layout|split)"):
         load_icrl4aht(**wanted)
 
 
-def test_positions_ids_and_iteration(lite):
+def test_histories_are_found_by_position_id_and_iteration(lite):
     dataset = load_icrl4aht(lite[0]).select([5, 2])
     assert [history.entry.history_id for history in dataset] == [5, 2]
     assert dataset[1].entry.history_id == 2
@@ -70,7 +70,7 @@ def test_positions_ids_and_iteration(lite):
         dataset.history(99)
 
 
-def test_other_options_share_index_and_shards(lite, converted_release):
+def test_with_options_shares_index_and_shards(lite, converted_release):
     dataset = load_icrl4aht(lite[0], layout="demo_wide", threads=1)
     dataset[0].actions[:]
     states = dataset.with_options(obs="state", cache="stream")
@@ -88,7 +88,7 @@ def test_other_options_share_index_and_shards(lite, converted_release):
 
 
 @pytest.mark.parametrize("rows", [(0, None), (10, 50), (-20, None), (30, 30), (500, 600), (119, 120)], ids=str)
-def test_rows_of_a_field(lite, rows):
+def test_reading_a_range_of_a_field_returns_its_rows(lite, rows):
     root, written = lite
     history, expected = load_icrl4aht(root)[4], written[4]["state"]
     np.testing.assert_array_equal(history.read("state", *rows), expected[slice(*rows)], strict=True)
@@ -109,12 +109,12 @@ def test_rows_of_a_field(lite, rows):
         lambda ds: ds[0]["nothing"],
     ],
 )
-def test_invalid_positions(lite, use):
+def test_invalid_positions_raise_package_errors(lite, use):
     with pytest.raises(Icrl4ahtError):
         use(load_icrl4aht(lite[0]))
 
 
-def test_a_field_is_one_read_only_array(lite):
+def test_history_fields_are_cached_read_only_arrays(lite):
     history = load_icrl4aht(lite[0])[4]
     assert history.actions is history["actions"] and isinstance(history.actions, np.ndarray)
     assert history.episodes[1].obs.base is None, "an episode reads its own steps only"
@@ -125,7 +125,7 @@ def test_a_field_is_one_read_only_array(lite):
 
 
 @pytest.mark.parametrize("obs", ["float32", "uint8", "state"])
-def test_observations_follow_the_obs_option(lite_or_full, obs):
+def test_obs_option_sets_the_type_of_observations(lite_or_full, obs):
     root, written = lite_or_full
     history = load_icrl4aht(root, layout="demo_wide", obs=obs)[0]
     state = written[history.entry.history_id]["state"]
@@ -134,7 +134,7 @@ def test_observations_follow_the_obs_option(lite_or_full, obs):
     np.testing.assert_array_equal(history.obs, expected)
 
 
-def test_environment_parameters_and_teammate(lite):
+def test_environment_parameters_and_teammate_of_a_history_are_returned(lite):
     dataset = load_icrl4aht(lite[0])
     environment = dataset.environment_parameters(8)
     assert environment["environment_name"] == "demo_cook_wide"
@@ -144,13 +144,13 @@ def test_environment_parameters_and_teammate(lite):
     assert (teammate["kind"], teammate["family"], teammate["theta_id"]) == ("heuristic", "utility_greedy", 0)
 
 
-def test_returns_are_the_learning_curve(lite):
+def test_returns_are_the_sums_of_rewards_per_episode(lite):
     root, written = lite
     expected = written[3]["rewards"].reshape(6, 20).sum(axis=1)
     np.testing.assert_allclose(load_icrl4aht(root)[3].returns(), expected, rtol=0, atol=1e-9)
 
 
-def test_ids_that_are_no_integers(lite):
+def test_invalid_history_ids_raise_errors(lite):
     dataset = load_icrl4aht(lite[0])
     wrong_ids: list[Any] = ["x", 1.5, None]
     for call in (dataset.history, dataset.recover_environment, dataset.environment_parameters, dataset.reset_options):

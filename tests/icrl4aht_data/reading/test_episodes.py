@@ -1,4 +1,4 @@
-"""Episodes of histories; splits, samples, order and predicates of selections."""
+"""Test episodes of histories, and splitting, sampling, sorting and filtering of selections."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def dataset(lite) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def two_sourced(two_sources) -> Dataset:
+def both_sources(two_sources) -> Dataset:
     return load_icrl4aht(two_sources[0])
 
 
 class TestEpisodes:
     @pytest.mark.parametrize("name", ["actions", "rewards", "dones", "teammate_actions", "expert_actions", "state"])
-    def test_arrays_are_those_that_were_written(self, lite, dataset, name):
+    def test_episode_arrays_equal_the_written_arrays(self, lite, dataset, name):
         written = lite[1][7][name]
         for number, episode in enumerate(dataset.history(7).episodes):
             expected = written[number * STEPS : (number + 1) * STEPS]
@@ -42,14 +42,14 @@ class TestEpisodes:
             np.testing.assert_array_equal(getattr(episode, name), expected)
             np.testing.assert_array_equal(episode[name], expected)
 
-    def test_observations_are_those_of_the_history(self, dataset):
+    def test_episode_observations_equal_those_of_the_history(self, dataset):
         history = dataset[8]
         for chosen in (history, dataset.with_options(obs="state", channels="canonical")[8]):
             episode = chosen.episodes[2]
             np.testing.assert_array_equal(episode.obs, chosen.obs[2 * STEPS : 3 * STEPS], strict=True)
             np.testing.assert_array_equal(episode.episode_end_state, chosen.episode_end_state[2], strict=True)
 
-    def test_indices_and_slices(self, dataset):
+    def test_episodes_are_found_by_index_and_slice(self, dataset):
         history = dataset[0]
         episodes = history.episodes
         assert len(episodes) == history.entry.episodes == 6
@@ -72,7 +72,7 @@ class TestEpisodes:
         with pytest.raises(PositionError, match="position 99 of the selection's histories: expected a number from -12"):
             dataset[99]
 
-    def test_fields_by_name(self, dataset):
+    def test_fields_are_read_by_name(self, dataset):
         history = dataset[0]
         np.testing.assert_array_equal(history["actions"], history.actions[:])
         np.testing.assert_array_equal(history["obs"][:3], history.obs[:3])
@@ -83,8 +83,8 @@ class TestEpisodes:
                 iter(holder)  # type: ignore[call-overload]
 
 
-class TestPictures:
-    def test_an_animation(self, dataset, tmp_path):
+class TestAnimations:
+    def test_animate_returns_a_gif_of_an_episode(self, dataset, tmp_path):
         history = dataset[6]
         picture = history.animate(2, cell=16)
         picture.save(tmp_path / "episode.gif")
@@ -97,11 +97,11 @@ class TestPictures:
             picture.save(tmp_path / "x.png")
 
     @pytest.mark.parametrize("episode", [6, -7, 1.0, True])
-    def test_episodes_that_do_not_exist(self, dataset, episode):
+    def test_animate_refuses_invalid_episode_numbers(self, dataset, episode):
         with pytest.raises((OptionError, PositionError), match=r"expected an integer|expected a number from -6 to 5"):
             dataset[6].animate(episode)
 
-    def test_pictures_need_state_records(self, full, tmp_path):
+    def test_animate_needs_state_records(self, full, tmp_path):
         to_release(load_icrl4aht(full[0]), tmp_path / "o", "observations")
         with pytest.raises(NotStoredError, match="this release has observations only"):
             load_icrl4aht(tmp_path / "o")[0].animate()
@@ -109,37 +109,37 @@ class TestPictures:
 
 class TestSplit:
     @pytest.mark.parametrize("by", ["teammate", "history"])
-    def test_parts_are_disjoint_and_do_not_depend_on_order(self, two_sourced, by):
-        train, validation = two_sourced.split(0.25, seed=3, by=by)
-        assert sorted([*train.ids, *validation.ids]) == sorted(two_sourced.ids)
-        shuffled = two_sourced.select(np.random.default_rng(0).permutation(two_sourced.ids))
+    def test_split_parts_are_disjoint_and_independent_of_order(self, both_sources, by):
+        train, validation = both_sources.split(0.25, seed=3, by=by)
+        assert sorted([*train.ids, *validation.ids]) == sorted(both_sources.ids)
+        shuffled = both_sources.select(np.random.default_rng(0).permutation(both_sources.ids))
         assert set(shuffled.split(0.25, seed=3, by=by)[1].ids) == set(validation.ids)
-        others = {tuple(two_sourced.split(0.25, seed=seed, by=by)[1].ids) for seed in range(5)}
+        others = {tuple(both_sources.split(0.25, seed=seed, by=by)[1].ids) for seed in range(5)}
         assert len(others) > 1
 
-    def test_split_by_teammate_has_no_shared_teammates(self, two_sourced):
-        train, validation = (set(part.column("task_id")) for part in two_sourced.split(0.3))
+    def test_split_by_teammate_has_no_shared_teammates(self, both_sources):
+        train, validation = (set(part.column("task_id")) for part in both_sources.split(0.3))
         assert train and validation and not train & validation
 
-    def test_split_by_history_keeps_every_task_in_training(self, two_sourced):
-        train, validation = two_sourced.split(0.9, by="history")
-        assert set(validation.column("task_id")) <= set(train.column("task_id")) == set(two_sourced.column("task_id"))
+    def test_split_by_history_keeps_every_task_in_training(self, both_sources):
+        train, validation = both_sources.split(0.9, by="history")
+        assert set(validation.column("task_id")) <= set(train.column("task_id")) == set(both_sources.column("task_id"))
 
-    def test_invalid_splits(self, two_sourced):
-        one = two_sourced.filter(task_id=str(two_sourced.column("task_id")[0]))
+    def test_invalid_splits_raise_errors(self, both_sources):
+        one = both_sources.filter(task_id=str(both_sources.column("task_id")[0]))
         with pytest.raises(OptionError, match=r'has one teammate, so none can be held out; use by="history"'):
             one.split()
         with pytest.raises(OptionError, match=r"every task of .* has one history"):
             one[:1].split(by="history")
         for share in (0, 1, 1.5, True, "a"):
             with pytest.raises(OptionError, match=rf"validation = {share!r}: expected "):
-                two_sourced.split(share)
+                both_sources.split(share)
         with pytest.raises(UnknownNameError, match=r"unknown split by 'task'; valid: teammate, history"):
-            two_sourced.split(by="task")  # type: ignore[arg-type]
+            both_sources.split(by="task")  # type: ignore[arg-type]
 
 
-class TestSampling:
-    def test_episodes_are_different_and_a_function_of_the_seed(self, dataset):
+class TestSampleEpisodes:
+    def test_sampled_episodes_are_distinct_and_depend_on_the_seed(self, dataset):
         found = [(one.entry.history_id, one.number) for one in dataset.sample_episodes(30, seed=2)]
         assert len(set(found)) == 30
         assert found == sorted(found)
@@ -147,72 +147,72 @@ class TestSampling:
         assert found != [(one.entry.history_id, one.number) for one in dataset.sample_episodes(30, seed=3)]
         assert len(dataset.sample_episodes(72)) == 12 * 6
 
-    def test_every_episode_is_equally_likely(self, dataset):
+    def test_episodes_are_sampled_with_equal_probability(self, dataset):
         part = dataset[:2]
         counts = np.zeros((2, 6))
         for seed in range(600):
             for one in part.sample_episodes(4, seed=seed):
                 counts[one.entry.history_id, one.number] += 1
         assert counts.sum() == 2400
-        assert np.abs(counts - 200).max() < 60  # five standard deviations
+        assert np.abs(counts - 200).max() < 60  # 60 is about five standard deviations
 
     @pytest.mark.parametrize(
         ("n", "message"), [(73, "the selection has 72 episodes"), (0, "at least 1"), (1.5, "integer")]
     )
-    def test_invalid_sample_sizes(self, dataset, n, message):
+    def test_invalid_sample_sizes_raise_errors(self, dataset, n, message):
         with pytest.raises(OptionError, match=f"n = {n}: .*{message}"):
             dataset.sample_episodes(n)
 
 
-class TestOrder:
-    def test_numbers_and_names(self, two_sourced):
-        ordered = two_sourced.sort("return_end")
+class TestSort:
+    def test_sort_orders_histories_by_numbers_and_names(self, both_sources):
+        ordered = both_sources.sort("return_end")
         assert (np.diff(ordered.column("return_end")) >= 0).all()
-        assert (np.diff(two_sourced.sort("return_end", reverse=True).column("return_end")) <= 0).all()
-        by_both = two_sourced[::-1].sort("layout", "history_id")
+        assert (np.diff(both_sources.sort("return_end", reverse=True).column("return_end")) <= 0).all()
+        by_both = both_sources[::-1].sort("layout", "history_id")
         assert by_both.ids.tolist() == [
-            row for _, row in sorted(zip(two_sourced.column("layout"), two_sourced.ids.tolist(), strict=True))
+            row for _, row in sorted(zip(both_sources.column("layout"), both_sources.ids.tolist(), strict=True))
         ]
-        assert len(by_both.sort("obs_shape")) == len(two_sourced)
+        assert len(by_both.sort("obs_shape")) == len(both_sources)
 
-    def test_equal_histories_keep_their_order(self, two_sourced):
+    def test_sort_keeps_the_order_of_equal_histories(self, both_sources):
         for reverse in (False, True):
-            again = two_sourced.sort("action_dim", reverse=reverse)
-            assert again.ids.tolist() == two_sourced.ids.tolist()
+            again = both_sources.sort("action_dim", reverse=reverse)
+            assert again.ids.tolist() == both_sources.ids.tolist()
 
-    def test_unknown_values_are_last(self, two_sourced):
-        steps = two_sourced.column("expert_step")
+    def test_sort_puts_unknown_values_last(self, both_sources):
+        steps = both_sources.column("expert_step")
         assert (steps == -1).any()
         known = int((steps != -1).sum())
         for reverse in (False, True):
-            assert (two_sourced.sort("expert_step", reverse=reverse).column("expert_step")[known:] == -1).all()
+            assert (both_sources.sort("expert_step", reverse=reverse).column("expert_step")[known:] == -1).all()
 
-    def test_wrong_names(self, two_sourced):
+    def test_sort_refuses_invalid_column_names(self, both_sources):
         with pytest.raises(UnknownNameError, match="unknown column 'return'"):
-            two_sourced.sort("return")
+            both_sources.sort("return")
         wrong_names: list[Any] = [(), (["layout", "return_end"],), (lambda entry: entry.T,)]
         for wrong in wrong_names:
             with pytest.raises(OptionError, match=r'index fields, such as ds.sort\("layout", "return_end"\)'):
-                two_sourced.sort(*wrong)
+                both_sources.sort(*wrong)
 
 
-class TestPredicates:
-    def test_entries_that_pass(self, two_sourced):
-        found = two_sourced.filter(lambda entry: entry.env_idx > 0, source="noise", split="train")
-        assert 0 < len(found) < len(two_sourced)
+class TestFilterFunctions:
+    def test_filter_function_selects_histories(self, both_sources):
+        found = both_sources.filter(lambda entry: entry.env_idx > 0, source="noise", split="train")
+        assert 0 < len(found) < len(both_sources)
         assert (found.column("env_idx") > 0).all()
         assert set(found.column("source")) == {"noise"}
-        whole = two_sourced.filter(source="noise", split="train")
+        whole = both_sources.filter(source="noise", split="train")
         assert found.ids.tolist() == whole.ids[whole.column("env_idx") > 0].tolist()
 
-    def test_nothing_passes_or_no_function(self, two_sourced):
+    def test_filter_refuses_empty_results_and_non_functions(self, both_sources):
         with pytest.raises(EmptySelectionError, match="no history of this selection passes the function"):
-            two_sourced.filter(lambda entry: False)
+            both_sources.filter(lambda entry: False)
         with pytest.raises(OptionError, match=r"filter: expected a function .*found 'demo_wide'"):
-            two_sourced.filter("demo_wide")
+            both_sources.filter("demo_wide")
 
-    def test_wrong_functions(self, two_sourced):
+    def test_faulty_filter_functions_raise_errors(self, both_sources):
         with pytest.raises(AttributeError, match="layuot"):
-            two_sourced.filter(lambda entry: entry.layuot == "demo_wide")
+            both_sources.filter(lambda entry: entry.layuot == "demo_wide")
         with pytest.raises(OptionError, match=r"expected the function to return True or False, found str"):
-            two_sourced.filter(lambda entry: entry.layout)
+            both_sources.filter(lambda entry: entry.layout)

@@ -1,4 +1,4 @@
-"""Releases of observations: converted from published files without state records."""
+"""Test releases of observations, which are converted from published files without state records."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.helpers.spoiled import change_file, read_lines, spoil
 
 
 class TestConversion:
-    def test_arrays_and_index_are_those_of_the_files(self, published_folder, converted_release):
+    def test_converted_arrays_and_index_equal_the_published_files(self, published_folder, converted_release):
         folder, written = published_folder
         dataset = load_icrl4aht(converted_release, obs="uint8")
         assert dataset.info.kind == "observations"
@@ -49,7 +49,7 @@ class TestConversion:
         statistics = dataset.info.statistics["demo_wide"]
         assert (statistics.history_length, statistics.teammates) == ((50, 130), None)
 
-    def test_exporting_and_importing_round_trips(self, converted_release, tmp_path):
+    def test_export_then_import_returns_the_same_release(self, converted_release, tmp_path):
         to_published(load_icrl4aht(converted_release), tmp_path / "files")
         assert not (tmp_path / "files" / "tasks.jsonl").exists()
         from_published(tmp_path / "files", tmp_path / "back", kept_steps=KEPT)
@@ -65,7 +65,7 @@ class TestConversion:
         ):
             from_published(published_folder[0], tmp_path / "out", kind, kept_steps=KEPT)
 
-    def test_states_may_be_left_out(self, lite, reconverted_release, tmp_path):
+    def test_releases_with_states_can_be_converted_to_observations(self, lite, reconverted_release, tmp_path):
         """Lite releases and published files with states can be converted without their states."""
         to_published(load_icrl4aht(lite[0]), tmp_path / "files")
         to_release(load_icrl4aht(lite[0]), tmp_path / "one", "observations")
@@ -74,7 +74,7 @@ class TestConversion:
             assert (root / SHARD).read_bytes() == (reconverted_release / SHARD).read_bytes()
         assert from_published(tmp_path / "files", tmp_path / "three", kept_steps=KEPT) == "lite"
 
-    def test_some_groups_with_states(self, lite, tmp_path):
+    def test_files_with_states_in_only_some_groups_are_refused(self, lite, tmp_path):
         to_published(load_icrl4aht(lite[0]), tmp_path / "files")
         with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
             del file["/4/state"]
@@ -82,7 +82,7 @@ class TestConversion:
             from_published(tmp_path / "files", tmp_path / "out", kept_steps=KEPT)
 
 
-def put(name: str, where: Any, value: Any):
+def assign(name: str, where: Any, value: Any):
     def spoil(file: h5py.File, index: list[dict]) -> None:
         dataset: Any = file[name]
         array = dataset[()].astype("f4")
@@ -93,55 +93,56 @@ def put(name: str, where: Any, value: Any):
     return spoil
 
 
-def drop(name: str):
+def delete(name: str):
     return lambda file, index: file.pop(name)
 
 
-def replace(name: str, content: Any):
+def rewrite(name: str, content: Any):
     return lambda file, index: (file.pop(name), file.create_dataset(name, data=content))
 
 
-def edit(number: int, **fields: Any):
+def edit_line(number: int, **fields: Any):
     return lambda file, index: index[number].update(fields)
 
 
-class TestFaults:
+class TestFaultyFiles:
     @pytest.mark.parametrize(
         ("spoil", "message"),
         [
             (
-                put("/1/obs", (7, 1, 2, 3), 0.5),
+                assign("/1/obs", (7, 1, 2, 3), 0.5),
                 r"group /1: obs\[7, 1, 2, 3\]: expected an integer 0\.\.255, .* 0\.5",
             ),
-            (put("/0/obs", (0, 0, 0, 0), 256), r"group /0: obs\[0, 0, 0, 0\]: expected .* found 256"),
-            (put("/3/obs", (0, 0, 0, 0), np.nan), r"group /3: obs.* found nan"),
-            (put("/0/actions", 9, 6), r"group /0: actions\[9\]: expected an integer 0\.\.5, found 6"),
-            (put("/1/expert_actions", 2, 1.5), r"group /1: expert_actions\[2\]"),
-            (put("/2/rewards", 5, 0.25), r"group /2: rewards\[5\]: expected an integer -128\.\.127, found 0\.25"),
-            (put("/2/dones", 5, 2), r"group /2: dones\[5\]: expected an integer 0\.\.1, found 2"),
+            (assign("/0/obs", (0, 0, 0, 0), 256), r"group /0: obs\[0, 0, 0, 0\]: expected .* found 256"),
+            (assign("/3/obs", (0, 0, 0, 0), np.nan), r"group /3: obs.* found nan"),
+            (assign("/0/actions", 9, 6), r"group /0: actions\[9\]: expected an integer 0\.\.5, found 6"),
+            (assign("/1/expert_actions", 2, 1.5), r"group /1: expert_actions\[2\]"),
+            (assign("/2/rewards", 5, 0.25), r"group /2: rewards\[5\]: expected an integer -128\.\.127, found 0\.25"),
+            (assign("/2/dones", 5, 2), r"group /2: dones\[5\]: expected an integer 0\.\.1, found 2"),
             (
-                put("/2/dones", 5, 1),
+                assign("/2/dones", 5, 1),
                 r"group /2: dones: expected an episode end every 20 steps, found 4 .*\[5, 19, 39\].*--kept",
             ),
-            (drop("/1/obs"), r"histories\.h5, group /1: missing obs: complete the file"),
-            (drop("/1/expert_actions"), r"group /1: missing expert_actions: complete the file"),
-            (drop("/3"), r"group /3 is missing, but the index has a line"),
+            (delete("/1/obs"), r"histories\.h5, group /1: missing obs: complete the file"),
+            (delete("/1/expert_actions"), r"group /1: missing expert_actions: complete the file"),
+            (delete("/3"), r"group /3 is missing, but the index has a line"),
             (
-                replace("/0/actions", np.zeros(9, "i4")),
+                rewrite("/0/actions", np.zeros(9, "i4")),
                 r"group /0: actions: .*expected numbers of shape \(120,\), found int32 of shape \(9,\)",
             ),
             (
-                replace("/0/actions", np.array([b"x"] * 120)),
+                rewrite("/0/actions", np.array([b"x"] * 120)),
                 r"group /0: actions: .*expected numbers or small arrays of numbers, found \|S1",
             ),
-            (edit(2, layout="demo_simple"), None),  # equal channel counts, so the files do not reveal the fault
-            (edit(2, split="test", layout="demo_wide"), r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)"),
-            (edit(1, teammate_kind="other"), r"index\.jsonl: history 1 has .*'other'.*, but its task 'task_a' has"),
-            (edit(1, T="many"), r"index\.jsonl, line 2: Expected `int`, got `str` - at `\$\.T`"),
-            (edit(3, layout="nowhere"), r"index\.jsonl, line 4: unknown layout"),
+            # Both layouts have equally many channels, so conversion cannot find this fault.
+            (edit_line(2, layout="demo_simple"), None),
+            (edit_line(2, split="test", layout="demo_wide"), r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)"),
+            (edit_line(1, teammate_kind="other"), r"index\.jsonl: history 1 has .*'other'.*, but its task 'task_a' has"),
+            (edit_line(1, T="many"), r"index\.jsonl, line 2: Expected `int`, got `str` - at `\$\.T`"),
+            (edit_line(3, layout="nowhere"), r"index\.jsonl, line 4: unknown layout"),
         ],
     )
-    def test_files_with_faults(self, published_folder, tmp_path, spoil, message):
+    def test_faults_of_published_files_are_found(self, published_folder, tmp_path, spoil, message):
         files = shutil.copytree(published_folder[0], tmp_path / "files")
         with h5py.File(files / "histories.h5", "r+") as file:
             change_file(files / HISTORIES_INDEX, lambda lines: spoil(file, lines))
@@ -155,22 +156,22 @@ class TestFaults:
             from_published(files, tmp_path / "out", kept_steps=KEPT)
         assert not (tmp_path / "out").exists()
 
-    def test_another_episode_length(self, published_folder, tmp_path):
+    def test_files_with_another_episode_length_are_refused(self, published_folder, tmp_path):
         with pytest.raises(PublishedFormatError, match=r"group /0: dones: .* every 100 steps, found 6"):
             from_published(published_folder[0], tmp_path / "out")
         with pytest.raises(OptionError, match="kept_steps = 0"):
             from_published(published_folder[0], tmp_path / "out", kept_steps=0)
 
-    def test_states_need_complete_episodes(self, tmp_path):
-        def cut(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def test_releases_with_states_need_complete_episodes(self, tmp_path):
+        def keep_50_steps(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             return {name: array[: 2 if name == "episode_end_state" else 50] for name, array in arrays.items()}
 
         with pytest.raises(OptionError, match="expected histories with episodes of 20 steps"):
-            one_history_release(tmp_path / "r", cut)
+            one_history_release(tmp_path / "r", keep_50_steps)
 
 
 class TestTasks:
-    def test_without_tasks_teammates_have_names_only(self, converted_release):
+    def test_teammates_without_tasks_are_known_by_name_only(self, converted_release):
         dataset = load_icrl4aht(converted_release)
         assert (converted_release / "meta" / "tasks.jsonl").read_text() == ""
         assert {entry.seed for entry in dataset.entries} == {-1}
@@ -181,7 +182,7 @@ class TestTasks:
         assert dataset.environment_parameters(0)["layout"] == "demo_wide"
         assert len(load_icrl4aht(converted_release, teammate_family="H2", task_id="task_c")) == 1
 
-    def test_with_tasks_teammates_are_complete(self, lite, reconverted_release):
+    def test_tasks_of_published_files_restore_teammates(self, lite, reconverted_release):
         one, two = load_icrl4aht(lite[0]), load_icrl4aht(reconverted_release)
         assert (reconverted_release / "meta" / "tasks.jsonl").read_text() == (
             lite[0] / "meta" / "tasks.jsonl"
@@ -189,7 +190,7 @@ class TestTasks:
         assert two.recover_teammate(8) == one.recover_teammate(8)
         assert [entry.seed for entry in two.entries] == [entry.seed for entry in one.entries]
 
-    def test_partial_tasks_are_refused(self, published_folder, tmp_path):
+    def test_incomplete_task_files_are_refused(self, published_folder, tmp_path):
         source = shutil.copytree(published_folder[0], tmp_path / "source")
         write_tasks(source / "tasks.jsonl", make_tasks(["demo_wide"]))
         with pytest.raises(PublishedFormatError, match=r"tasks\.jsonl: 3 tasks .* are missing, such as 'task_a'"):
@@ -197,7 +198,7 @@ class TestTasks:
 
 
 class TestWithoutStates:
-    def test_missing_states_are_an_error(self, converted_release):
+    def test_reading_missing_states_raises_errors(self, converted_release):
         with pytest.raises(
             OptionError, match=r'obs = "state": .* has observations only, no state records; use float32'
         ):
@@ -211,7 +212,7 @@ class TestWithoutStates:
         with pytest.raises(NotStoredError, match="use hf_windows"):
             hf_episodes(dataset)
 
-    def test_missing_teammate_actions(self, converted_release):
+    def test_reading_missing_teammate_actions_raises_errors(self, converted_release):
         dataset = load_icrl4aht(converted_release, task_id="task_c")
         with pytest.raises(LabelsMissingError, match=r"no teammate actions: .* has_teammate_actions = false"):
             dataset[0].teammate_actions  # noqa: B018
@@ -221,7 +222,7 @@ class TestWithoutStates:
             mixed = load_icrl4aht(converted_release, layout="demo_wide", cache=cache)
             assert mixed.ad(batch_size=9, length=5)[0].prev_teammate_actions is None
 
-    def test_a_large_index_counts_teammate_actions(self, tmp_path):
+    def test_has_teammate_actions_is_read_from_a_large_index(self, tmp_path):
         long_index(tmp_path / "r")
         has = [number % 3 > 0 for number in range(3000)]
         change = {number: {"has_teammate_actions": value} for number, value in enumerate(has)}
@@ -238,9 +239,11 @@ class TestBatches:
     @pytest.mark.parametrize("cache", CACHES)
     @pytest.mark.parametrize("order", ["contiguous", "random"])
     @pytest.mark.parametrize("options", [{}, {"episodes": (1, 3)}, {"episodes": (-1, None)}])
-    def test_no_context_has_an_episodes_last_step(self, converted_release, published_folder, cache, order, options):
+    def test_contexts_exclude_the_last_steps_of_episodes(
+        self, converted_release, published_folder, cache, order, options
+    ):
         """Contexts exclude last steps, also of unfinished episodes, and contain all other steps."""
-        arrays = published_folder[1][1]  # 130 steps: six episodes and a half
+        arrays = published_folder[1][1]  # 130 steps: six complete episodes and half an episode
         dataset = load_icrl4aht(converted_release, obs="uint8", cache=cache).select([1])
         sampler = dataset.dpt(batch_size=40, context=15, order=order, seed=2, teammate_actions=True, **options)
         low, high = {(1, 3): (20, 60), (-1, None): (100, 130)}.get(options.get("episodes"), (0, 130))
@@ -259,14 +262,13 @@ class TestBatches:
             np.testing.assert_array_equal(batch.context_teammate_actions, arrays["teammate_actions"][steps])
         assert met == {t for t in range(low, high) if t % KEPT != KEPT - 1 and t != 129}
 
-    def test_queries_are_at_every_step(self, converted_release):
+    def test_queries_are_drawn_from_every_step(self, converted_release):
         sampler = load_icrl4aht(converted_release).select([0]).dpt(batch_size=2000, context=1)
         assert set(sampler._draw(0)[1].ravel().tolist()) == set(range(120))
 
-    def test_invalid_contexts(self, converted_release, tmp_path):
-        dataset = load_icrl4aht(
-            converted_release, task_id="task_a", obs="uint8"
-        )  # 120 and 130 steps: 114 and 123 transitions
+    def test_invalid_contexts_raise_errors(self, converted_release, tmp_path):
+        # the histories have 114 and 123 transitions
+        dataset = load_icrl4aht(converted_release, task_id="task_a", obs="uint8")
         assert dataset.dpt(batch_size=2, context=114)[0].context_obs.shape == (2, 114, 5, 5, 45)
         with pytest.raises(OptionError, match="context = 115: the shortest history has 114 transitions"):
             dataset.dpt(batch_size=2, context=115)
@@ -278,7 +280,7 @@ class TestBatches:
         with pytest.raises(LabelsMissingError, match="labels = expert: 1 of 1 histories have no expert actions"):
             load_icrl4aht(converted_release, task_id="task_b").dpt(batch_size=2, context=5)
 
-    def test_positions_of_other_contexts_are_not_resumed(self, lite, reconverted_release):
+    def test_saved_position_of_other_contexts_is_refused(self, lite, reconverted_release):
         one, two = (
             load_icrl4aht(root, layout="demo_wide").dpt(batch_size=2, context=5)
             for root in (lite[0], reconverted_release)
@@ -288,7 +290,7 @@ class TestBatches:
 
 
 class TestCombine:
-    def test_combining_releases_of_observations(
+    def test_combine_accepts_releases_of_observations(
         self, converted_release, published_folder, reconverted_release, lite, tmp_path
     ):
         other = shutil.copytree(published_folder[0], tmp_path / "files")

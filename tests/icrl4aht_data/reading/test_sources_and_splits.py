@@ -1,4 +1,4 @@
-"""Histories by source, split and learner: filters, counts and `repr`."""
+"""Test filters by source, split and learner, and counts of histories."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, UnknownNameError
 
 
-def test_learners(two_sources):
+def test_learner_filter_selects_histories(two_sources):
     dataset = load_icrl4aht(two_sources[0], source="ppo", learner=1)
     assert (len(dataset), set(dataset.column("learner"))) == (8, {1})
     assert len(load_icrl4aht(two_sources[0], learner=[0, 1])) == 40
@@ -19,7 +19,7 @@ def test_learners(two_sources):
         load_icrl4aht(two_sources[0], learner="first")  # type: ignore[arg-type]
 
 
-def test_counts_and_describe(two_sources):
+def test_counts_and_describe_summarize_a_selection(two_sources):
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide")
     assert dataset.counts("source") == {"ppo": 8, "noise": 12}
     assert dataset.counts("labels") == {"expert": 20, "oracle": 20}

@@ -1,4 +1,4 @@
-"""Invalid options of loading and sampling raise an error of the package that names the value."""
+"""Test that invalid options of loading and sampling raise package errors that name the value."""
 
 from __future__ import annotations
 
@@ -76,24 +76,24 @@ def dataset(lite):
 
 
 @pytest.mark.parametrize("message", WRONG_OPTIONS)
-def test_options_of_samplers(dataset, message):
+def test_invalid_sampler_options_raise_errors(dataset, message):
     with pytest.raises(Icrl4ahtError, match=message):
         dataset.ad(**SIZES | WRONG_OPTIONS[message])
 
 
 @pytest.mark.parametrize("message", WRONG_CONTEXTS)
-def test_options_of_contexts(dataset, message):
+def test_invalid_context_options_raise_errors(dataset, message):
     with pytest.raises(Icrl4ahtError, match=message):
         dataset.dpt(batch_size=2, **WRONG_CONTEXTS[message])
 
 
 @pytest.mark.parametrize("message", WRONG_CALLS)
-def test_calls(dataset, message):
+def test_invalid_arguments_raise_errors(dataset, message):
     with pytest.raises(Icrl4ahtError, match=message):
         WRONG_CALLS[message](dataset)
 
 
-def test_buffers_of_other_batches(dataset):
+def test_buffers_of_wrong_shape_or_memory_order_are_refused(dataset):
     one, two = (dataset.ad(batch_size=2, length=length) for length in (5, 6))
     with pytest.raises(OptionError, match=r"out: expected .*obs.*\(2, 5, 5, 5, 45\).*found .*\(2, 6, 5, 5, 45\)"):
         one.batch(0, two.empty())

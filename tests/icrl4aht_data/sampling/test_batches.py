@@ -1,4 +1,4 @@
-"""Prefetched batches: order, buffers, devices, errors and resume."""
+"""Test prefetched batches: order, buffers, devices, errors and resume."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def sampler(lite):
 
 @pytest.mark.parametrize("prefetch", [0, 1, 3])
 @pytest.mark.parametrize("reuse", [False, True])
-def test_batches_in_order(sampler, prefetch, reuse):
+def test_prefetched_batches_keep_their_order(sampler, prefetch, reuse):
     numbers, buffers = iter(range(4, 24)), set()
     with sampler.batches(4, 24, prefetch=prefetch, reuse=reuse) as batches:
         for batch in batches:
@@ -41,7 +41,7 @@ def test_batches_in_order(sampler, prefetch, reuse):
 
 
 @pytest.mark.parametrize("prefetch", [0, 2])
-def test_a_second_loop_continues_after_the_first(sampler, prefetch):
+def test_second_loop_over_batches_continues_after_the_first(sampler, prefetch):
     batches = sampler.batches(2, 5, prefetch=prefetch)
     for numbers in ([2, 3, 4], [5, 6, 7]):
         assert [batches.next - 1 for _ in batches] == numbers
@@ -57,8 +57,8 @@ def test_a_second_loop_continues_after_the_first(sampler, prefetch):
     assert_equal([*again, *again][3], sampler[3])
 
 
-def _aligned(array):
-    """Return an array aligned such that JAX would alias it instead of copying."""
+def _aligned_like(array):
+    """Return an empty array of the same shape, with a memory alignment that JAX would alias instead of copying."""
     if array is None:
         return None
     memory = np.empty(array.nbytes + 64, np.uint8)
@@ -66,9 +66,9 @@ def _aligned(array):
     return memory[start : start + array.nbytes].view(array.dtype).reshape(array.shape)
 
 
-def test_on_a_device(sampler, monkeypatch):
+def test_batches_on_a_device_equal_the_samplers_batches(sampler, monkeypatch):
     empty = sampler.empty
-    monkeypatch.setattr(sampler, "empty", lambda: type(empty())(*map(_aligned, empty())))
+    monkeypatch.setattr(sampler, "empty", lambda: type(empty())(*map(_aligned_like, empty())))
     batches = list(sampler.batches(stop=5, device=jax.devices()[0]))
     for i, batch in enumerate(batches):
         assert isinstance(batch.obs, jax.Array)
@@ -77,7 +77,7 @@ def test_on_a_device(sampler, monkeypatch):
         assert_equal(jax.tree.map(np.asarray, batch), in_32_bits)
 
 
-def test_prefetching_is_limited(sampler, monkeypatch):
+def test_prefetching_stops_after_the_given_number_of_batches(sampler, monkeypatch):
     made, plain = [], sampler.batch
     monkeypatch.setattr(sampler, "batch", lambda i, out=None: made.append(i) or plain(i, out))
     with sampler.batches(prefetch=2) as batches:
@@ -87,7 +87,7 @@ def test_prefetching_is_limited(sampler, monkeypatch):
 
 
 @pytest.mark.parametrize("prefetch", [0, 2])
-def test_an_exception_reaches_the_consumer(damaged, prefetch):
+def test_exception_while_prefetching_is_raised_to_the_consumer(damaged, prefetch):
     (damaged / SHARD).write_bytes((damaged / SHARD).read_bytes()[:3000])
     batches = load_icrl4aht(damaged, layout="coord_simple").ad(batch_size=8, length=9).batches(prefetch=prefetch)
     with pytest.raises(Exception, match="truncated"):
@@ -95,28 +95,28 @@ def test_an_exception_reaches_the_consumer(damaged, prefetch):
     assert next(batches, None) is None
 
 
-def test_closing_ends_the_thread(sampler):
-    def workers() -> int:
+def test_closing_or_deleting_batches_ends_their_thread(sampler):
+    def prefetch_threads() -> int:
         return sum(thread.name.startswith("icrl4aht-prefetch") for thread in threading.enumerate())
 
     with sampler.batches(prefetch=1) as batches:
         next(batches)
-        assert workers() == 1
-    assert workers() == 0
+        assert prefetch_threads() == 1
+    assert prefetch_threads() == 0
     abandoned = sampler.batches(prefetch=1)
     next(abandoned)
     del abandoned
     gc.collect()
     deadline = time.monotonic() + 20
-    while workers() and time.monotonic() < deadline:  # submitted batches are completed
+    while prefetch_threads() and time.monotonic() < deadline:  # the thread first completes submitted batches
         time.sleep(0.01)
-    assert workers() == 0
+    assert prefetch_threads() == 0
 
 
-def test_resuming_continues_exactly(sampler):
+def test_resumed_batches_continue_after_the_last_consumed_batch(sampler):
     batches = sampler.batches()
     for _ in range(4):
-        next(batches)  # prefetched but unconsumed batches are made again
+        next(batches)  # the saved position counts consumed batches, not prefetched ones
     state = json.loads(json.dumps(batches.state_dict()))
     batches.close()
     with sampler.batches() as resumed:
@@ -137,14 +137,14 @@ OTHER_BATCHES = {
 
 
 @pytest.mark.parametrize("message", OTHER_BATCHES)
-def test_positions_of_other_batches_are_not_resumed(two_sources, message):
+def test_saved_position_of_other_batches_is_refused(two_sources, message):
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
     state = dataset.ad(**SIZES).batches(prefetch=0).state_dict()
     with pytest.raises(OptionError, match=message):
         OTHER_BATCHES[message](dataset).batches(prefetch=0).load_state_dict(state)
 
 
-def test_positions_saved_before_an_option_existed_are_resumed(two_sources):
+def test_position_saved_before_an_option_existed_is_resumed(two_sources):
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
     for sampler in (dataset.ad(**SIZES), dataset.dpt(batch_size=3, context=9)):
         batches = sampler.batches(prefetch=0)
@@ -154,8 +154,8 @@ def test_positions_saved_before_an_option_existed_are_resumed(two_sources):
 
 
 @pytest.mark.parametrize("cache", CACHES)
-def test_memory_stays_flat(lite, cache):
-    def resident() -> int:
+def test_memory_use_stays_constant_over_many_batches(lite, cache):
+    def resident_bytes() -> int:
         gc.collect()
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
@@ -163,8 +163,8 @@ def test_memory_stays_flat(lite, cache):
     with sampler.batches(stop=600) as batches:
         for _ in range(200):
             next(batches)
-        early = resident()
+        early = resident_bytes()
         for _ in batches:
             pass
     assert batches.served == 600
-    assert resident() - early < 16 * 2**20
+    assert resident_bytes() - early < 16 * 2**20

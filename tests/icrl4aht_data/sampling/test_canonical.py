@@ -1,4 +1,4 @@
-"""Canonical channels in batches and histories: all kinds of releases, caches and loaders."""
+"""Test canonical channels in batches and histories, for all kinds of releases, caches and loaders."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ RELEASES = ["lite", "full", "reconverted_release"]
 
 @pytest.fixture(params=RELEASES)
 def root(request):
-    """Return releases of equal histories with states, both, and observations only."""
+    """Return releases of the same histories that store states, states and observations, or observations."""
     made = request.getfixturevalue(request.param)
     return made if request.param == "reconverted_release" else made[0]
 
 
-def canonical(root, **options) -> Any:
+def load_canonical(root, **options) -> Any:
     return load_icrl4aht(root, layout=LAYOUTS, channels="canonical", **{"obs": "uint8", "threads": 2} | options)
 
 
-def test_histories(root):
-    dataset = canonical(root)
+def test_canonical_histories_have_stored_channels_and_zeros(root):
+    dataset = load_canonical(root)
     own = dataset.with_options(channels="own")
     for number in (0, len(dataset) - 1):
         one, two = dataset[number], own[number]
@@ -46,20 +46,20 @@ def test_histories(root):
         np.testing.assert_array_equal(one.obs[7:9], one.obs[:][7:9])
         assert one.entry.obs_shape == two.obs.shape[1:], "the index has the shape of the own channels"
         np.testing.assert_array_equal(one.read("obs", 3, 5), two.obs[3:5], err_msg="fields are read as stored")
-    shown = canonical(root, obs="float32")[0].obs
+    shown = load_canonical(root, obs="float32")[0].obs
     assert (shown.shape[1:], shown.dtype, shown[3:5].dtype) == ((5, 5, 46), np.float32, np.float32)
 
 
-def kinds(dataset):
+def ad_and_dpt_samplers(dataset):
     return [
         dataset.ad(batch_size=8, length=50, seed=3),
-        dataset.ad(batch_size=6, length=130, seed=3),  # longer than the histories
+        dataset.ad(batch_size=6, length=130, seed=3),  # windows longer than the histories
         dataset.dpt(batch_size=8, context=17, seed=3),
         dataset.dpt(batch_size=8, context=17, seed=3, order="random"),
     ]
 
 
-def rendered(records, layouts):
+def render_canonical(records, layouts):
     """Return canonical observations of records, uint8 (B, ..., S), on layouts numbered by int (B,)."""
     views = []
     for row, number in zip(records, layouts, strict=True):
@@ -71,11 +71,11 @@ def rendered(records, layouts):
 @pytest.mark.parametrize("cache", CACHES)
 def test_batches_equal_rendered_state_records(lite, cache):
     rows = set()
-    states = canonical(lite[0], obs="state", cache="ram")
+    states = load_canonical(lite[0], obs="state", cache="ram")
     assert [layout.name for layout in states.layouts] == LAYOUTS
     for obs in ("uint8", "float32"):
-        dataset = canonical(lite[0], obs=obs, cache=cache)
-        for sampler, records in zip(kinds(dataset), kinds(states), strict=True):
+        dataset = load_canonical(lite[0], obs=obs, cache=cache)
+        for sampler, records in zip(ad_and_dpt_samplers(dataset), ad_and_dpt_samplers(states), strict=True):
             batch, stored = sampler[2], records[2]
             assert {name: (str(a.dtype), a.shape) for name, a in batch._asdict().items() if a is not None} == (
                 sampler.specs
@@ -85,7 +85,7 @@ def test_batches_equal_rendered_state_records(lite, cache):
             for name in (name for name in batch._fields if name.endswith("obs")):
                 shown = getattr(batch, name)
                 assert shown.dtype == obs
-                expected = rendered(getattr(stored, name), stored.layouts)
+                expected = render_canonical(getattr(stored, name), stored.layouts)
                 if name == "obs":
                     expected[~stored.attention_mask] = 0
                 np.testing.assert_array_equal(shown, expected)
@@ -99,7 +99,7 @@ def test_batches_equal_rendered_state_records(lite, cache):
 @pytest.mark.parametrize("cache", CACHES)
 @pytest.mark.parametrize("obs", ["uint8", "float32"])
 def test_stored_observations_are_mapped_to_canonical_channels(lite, reconverted_release, cache, obs):
-    original, stored = canonical(lite[0], obs=obs), canonical(reconverted_release, obs=obs, cache=cache)
+    original, stored = load_canonical(lite[0], obs=obs), load_canonical(reconverted_release, obs=obs, cache=cache)
     assert not stored.has_states
     for length in (1, 40, 130):
         options = {"batch_size": 8, "length": length, "seed": 5}
@@ -117,8 +117,8 @@ def test_stored_observations_are_mapped_to_canonical_channels(lite, reconverted_
     assert {"delivery"}.isdisjoint(np.array(CANONICAL_CHANNELS)[mixed.context_obs.any(axis=(0, 1, 2, 3))])
 
 
-def test_selections(root):
-    dataset = canonical(root)
+def test_selections_keep_the_channels_option(root):
+    dataset = load_canonical(root)
     assert (dataset.channels, dataset.obs_shape) == ("canonical", (5, 5, 46))
     assert "obs uint8 with canonical channels;" in repr(dataset)
     for part in (dataset.filter(layout="demo_wide"), dataset[:2], pickle.loads(pickle.dumps(dataset))):
@@ -131,7 +131,7 @@ def test_selections(root):
         r"has layouts coord_simple, demo_wide, and their observations have different shapes \(\(5, 5, 40\), "
         r'\(5, 5, 45\)\): choose channels="canonical", .* or one layout: layout=\'coord_simple\''
     )
-    for make in (lambda: own.obs_shape, lambda: own.ad(batch_size=2, length=5), lambda: kinds(own)):
+    for make in (lambda: own.obs_shape, lambda: own.ad(batch_size=2, length=5), lambda: ad_and_dpt_samplers(own)):
         with pytest.raises(OptionError, match=message):
             make()
     with pytest.raises(UnknownNameError, match=r"unknown channels 'canonic'; valid: own, canonical\..*'canonical'"):

@@ -1,4 +1,4 @@
-"""Windows of every n-th episode (option `every`)."""
+"""Test windows of every n-th episode, which the sampler option `every` selects."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from tests.helpers.two_sources import EPISODES, LENGTH
 OPTIONS: dict[str, Any] = {"batch_size": 32, "length": 2 * LENGTH + 7, "seed": 2}
 
 
-def following(step: int, every: int) -> int:
-    """Return the next step of the window."""
+def next_step(step: int, every: int) -> int:
+    """Return the step after `step` in a window of every n-th episode."""
     after = step + 1
     return after if after % LENGTH else after + (every - 1) * LENGTH
 
 
-def before(step: int, every: int) -> int:
-    """Return the previous step of the window; -1 before the first step."""
+def previous_step(step: int, every: int) -> int:
+    """Return the step before `step` in a window of every n-th episode; -1 before the first step."""
     skipped = (every - 1) * LENGTH
     return step - 1 if step % LENGTH or step <= skipped else step - 1 - skipped
 
 
 @pytest.mark.parametrize("cache", CACHES)
 @pytest.mark.parametrize("every", [2, 3, EPISODES, EPISODES + 5])
-def test_windows_skip_episodes(two_sources, cache, every):
+def test_windows_contain_only_every_nth_episode(two_sources, cache, every):
     root, written = two_sources
     dataset = load_icrl4aht(root, split="train", cache=cache, obs="state", channels="canonical")
     sampler = dataset.ad(every=every, labels="oracle", teammate_actions=True, **OPTIONS)
@@ -39,9 +39,9 @@ def test_windows_skip_episodes(two_sources, cache, every):
         assert batch.is_first is not None
         for row, (history, start) in enumerate(zip(*(values.tolist() for values in sampler.windows(i)), strict=True)):
             arrays, steps = written[history], [start]
-            while len(steps) < OPTIONS["length"] and following(steps[-1], every) < EPISODES * LENGTH:
-                steps.append(following(steps[-1], every))
-            previous = [before(start, every), *steps[:-1]]
+            while len(steps) < OPTIONS["length"] and next_step(steps[-1], every) < EPISODES * LENGTH:
+                steps.append(next_step(steps[-1], every))
+            previous = [previous_step(start, every), *steps[:-1]]
             valid = len(steps)
             padded += valid < OPTIONS["length"]
             assert batch.attention_mask[row].tolist() == [True] * valid + [False] * (OPTIONS["length"] - valid)
@@ -58,15 +58,15 @@ def test_windows_skip_episodes(two_sources, cache, every):
     assert bool(padded) == (every > 2)
 
 
-def test_all_windows_are_drawn(two_sources):
+def test_all_starts_of_windows_are_drawn(two_sources):
     """Every second of six episodes gives two sequences of three episodes, with 14 starts each."""
     sampler = load_icrl4aht(two_sources[0], layout="demo_wide", split="train").ad(every=2, **OPTIONS)
     starts = np.concatenate([sampler.windows(i)[1] for i in range(40)])
     assert set(starts.tolist()) == {*range(14), *range(LENGTH, LENGTH + 14)}
 
 
-def test_parts_of_histories(two_sources):
-    """The range has the last four of six episodes; batch 0 uses its first half, episodes 2 and 3."""
+def test_every_option_respects_episode_range_and_curriculum(two_sources):
+    """The episode range is the last four of six episodes; batch 0 uses its first half, episodes 2 and 3."""
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
     parts = dataset.ad(every=2, episodes=(-4, None), curriculum=Curriculum(9, (0, 0.5), (0.5, 1)), **OPTIONS)
     for i, first in ((0, 2), (9, 4), (50, 4)):

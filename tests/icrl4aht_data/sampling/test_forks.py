@@ -1,4 +1,4 @@
-"""Forking a process while a thread of the parent prepares a batch."""
+"""Test forking a process while a thread of the parent prepares a batch."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ for cache in sys.argv[2:]:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
-def test_a_child_makes_batches(lite, tmp_path):
+def test_forked_child_can_make_batches(lite, tmp_path):
     """Regression: the child hung on locks of a thread that existed only in the parent."""
     script = tmp_path / "fork.py"
     script.write_text(FORK)
-    # Python from 3.12 on warns of every fork of a process with threads.
+    # Python 3.12 and later warn when a process with threads forks.
     arguments = ["-W", "error", "-W", "ignore::DeprecationWarning", script, lite[0], "ram", "mmap", "stream"]
     printed = run_python(*arguments, ICRL4AHT_CACHE_DIR=str(tmp_path / "cache"))
     assert printed.splitlines() == ["ram 0", "mmap 0", "stream 0"]

@@ -1,4 +1,4 @@
-"""Labels (expert or oracle actions) in every storage, loader and device; missing labels."""
+"""Test expert and oracle labels in all caches and loaders, and errors for missing labels."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_targets_equal_the_labels_of_the_query_steps(two_sources, cache, labels,
 
 @pytest.mark.parametrize("labels", LABELS)
 @pytest.mark.parametrize("cache", CACHES)
-def test_label_kinds_change_the_targets_only(two_sources, cache, labels):
+def test_labels_option_changes_only_the_targets(two_sources, cache, labels):
     root, written = two_sources
     dataset = load_icrl4aht(root, cache=cache, channels="canonical", obs="uint8")
     options: dict[str, Any] = {"batch_size": 16, "length": 50, "seed": 4, "episodes": (-2, None)}
@@ -58,25 +58,27 @@ def test_label_kinds_change_the_targets_only(two_sources, cache, labels):
 
 
 @pytest.fixture(scope="module")
-def smaller(tmp_path_factory):
-    """Return `two_sources` with noise histories stored without oracle actions (read-only)."""
+def release_without_noise_oracle(tmp_path_factory):
+    """Return the release `two_sources` with noise histories stored without oracle actions (read-only)."""
     root = tmp_path_factory.mktemp("releases") / "smaller"
     two_source_release(root, oracle=("ppo",))
     return root
 
 
 class TestNoiseWithoutOracleActions:
-    """The expert of a noise history is the oracle, so its oracle actions may be left out."""
+    """The expert of a noise history is the oracle, so oracle actions need not be stored."""
 
     @pytest.mark.parametrize("cache", CACHES)
     @pytest.mark.parametrize("filters", [{}, {"source": "noise"}])
-    def test_batches_equal_those_with_stored_oracle_actions(self, two_sources, smaller, cache, filters):
+    def test_batches_equal_those_with_stored_oracle_actions(
+        self, two_sources, release_without_noise_oracle, cache, filters
+    ):
         options: dict[str, Any] = {"layout": "demo_wide", "cache": cache} | filters
-        one, other = (load_icrl4aht(root, **options) for root in (two_sources[0], smaller))
+        one, other = (load_icrl4aht(root, **options) for root in (two_sources[0], release_without_noise_oracle))
         assert_equal(one.dpt(labels="oracle", **OPTIONS)[0], other.dpt(labels="oracle", **OPTIONS)[0])
 
-    def test_histories_and_counts(self, two_sources, smaller):
-        dataset = load_icrl4aht(smaller, source="noise")
+    def test_oracle_labels_are_counted_and_read_from_expert_actions(self, two_sources, release_without_noise_oracle):
+        dataset = load_icrl4aht(release_without_noise_oracle, source="noise")
         assert not dataset.column("has_oracle_actions").any()
         assert dataset.counts("labels") == {"expert": 24, "oracle": 24}
         assert dataset.has_labels("oracle").all()
@@ -86,16 +88,16 @@ class TestNoiseWithoutOracleActions:
         rows: Any = hf_episodes(dataset[:1])
         np.testing.assert_array_equal(np.concatenate([row["oracle_actions"] for row in rows]), actions)
 
-    def test_verification_and_conversion_omit_oracle_actions(self, smaller, tmp_path):
-        to_release(load_icrl4aht(smaller), tmp_path / "full", "full")
+    def test_verification_and_conversion_accept_missing_oracle_actions(self, release_without_noise_oracle, tmp_path):
+        to_release(load_icrl4aht(release_without_noise_oracle), tmp_path / "full", "full")
         assert verify_release(tmp_path / "full", level="deep").ok
         to_release(load_icrl4aht(tmp_path / "full"), tmp_path / "lite", "lite")
         for name in (HISTORIES, PROVENANCE):
-            assert (tmp_path / "lite" / name).read_bytes() == (smaller / name).read_bytes()
+            assert (tmp_path / "lite" / name).read_bytes() == (release_without_noise_oracle / name).read_bytes()
 
 
 class TestMissingLabels:
-    def test_of_all_histories(self, lite):
+    def test_labels_missing_in_all_histories_raise_error(self, lite):
         dataset = load_icrl4aht(lite[0], layout="demo_wide")
         with pytest.raises(
             LabelsMissingError,
@@ -106,27 +108,27 @@ class TestMissingLabels:
         with pytest.raises(LabelsMissingError, match=r"history 6 .* has no oracle actions"):
             _ = dataset[0].oracle_actions
 
-    def test_of_some_histories(self, two_sources, monkeypatch):
+    def test_labels_missing_in_some_histories_raise_error(self, two_sources, monkeypatch):
         dataset = load_icrl4aht(two_sources[0], layout="demo_wide")
         column = type(dataset).column
 
-        def only_noise(self, name):
+        def column_with_oracle_only_for_noise(self, name):
             return column(self, "source") == "noise" if name == "has_oracle_actions" else column(self, name)
 
-        monkeypatch.setattr(type(dataset), "column", only_noise)
+        monkeypatch.setattr(type(dataset), "column", column_with_oracle_only_for_noise)
         with pytest.raises(LabelsMissingError, match=r"8 of 20 .*, 12 have oracle actions: .*has_labels\('oracle'"):
             dataset.dpt(labels="oracle", **OPTIONS)
 
 
-def test_weak_oracles_cause_a_warning(two_sources, monkeypatch):
-    """The oracle earns 5 in all tasks."""
+def test_weak_oracle_labels_cause_a_warning(two_sources, monkeypatch):
+    """The oracle earns 5 in all tasks, less than half of the patched final returns of 11."""
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", source="ppo")
     column = type(dataset).column
 
-    def earned(self, name):
+    def column_with_high_returns(self, name):
         return np.full(len(self), 11.0) if name == "return_end" else column(self, name)
 
-    monkeypatch.setattr(type(dataset), "column", earned)
+    monkeypatch.setattr(type(dataset), "column", column_with_high_returns)
     with pytest.warns(WeakLabelsWarning, match=r"of 2 of 2 tasks come from the oracle, .*labels 5\.0, histories 11"):
         dataset.dpt(labels="oracle", **OPTIONS)
     with pytest.warns(WeakLabelsWarning, match="of 2 of 2 tasks come from the oracle"):

@@ -1,4 +1,4 @@
-"""Caches, sampler options and buffers: all give equal batches."""
+"""Test that all caches give equal batches, and test sampler options and buffers."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ LAYOUTS = ("coord_simple", "demo_simple", "coord_ring")
 
 
 @pytest.fixture(scope="module")
-def three(tmp_path_factory):
-    """Return a release of three layouts, its source arrays, and a copy without states (read-only)."""
+def three_layouts(tmp_path_factory):
+    """Return a folder with a release of three layouts and a copy without states, and the written arrays."""
     root = tmp_path_factory.mktemp("three")
     written = random_release(root / "states", layouts=LAYOUTS, teammates=1)
     to_release(load_icrl4aht(root / "states"), root / "observations", "observations")
@@ -54,7 +54,7 @@ class TestCaches:
         for row, (history_id, start) in enumerate(zip(ids, starts, strict=True)):
             np.testing.assert_array_equal(batch.obs[row], lite[1][history_id]["state"][start : start + 20])
 
-    def test_automatic_choice_of_the_cache(self, lite, monkeypatch):
+    def test_auto_cache_depends_on_size_and_free_memory(self, lite, monkeypatch):
         dataset = load_icrl4aht(lite[0])
         assert dataset.cache.cache == "ram"
         assert "GB decoded" in dataset.cache.reason
@@ -65,7 +65,7 @@ class TestCaches:
         with pytest.raises(UnknownNameError, match="unknown cache 'disk'; valid: auto, ram, mmap, stream"):
             load_icrl4aht(lite[0], cache="disk")  # type: ignore[arg-type]
 
-    def test_threads_share_a_sampler(self, lite):
+    def test_threads_can_share_a_sampler(self, lite):
         sampler = load_icrl4aht(lite[0], layout="demo_wide", cache="stream", threads=2).ad(batch_size=9, length=30)
         found = {}
         workers = [threading.Thread(target=lambda k=k: found.update({k: sampler[k % 4]})) for k in range(12)]
@@ -80,8 +80,8 @@ class TestCaches:
 
 @pytest.mark.parametrize("cache", CACHES)
 class TestSeveralLayouts:
-    def test_windows(self, three, cache):
-        root, written = three
+    def test_windows_of_several_layouts_equal_the_histories(self, three_layouts, cache):
+        root, written = three_layouts
         shown, states = (
             load_icrl4aht(root / "states", obs=obs, cache=cache).ad(batch_size=32, length=130)
             for obs in ("uint8", "state")
@@ -101,8 +101,8 @@ class TestSeveralLayouts:
             assert not batch.obs[row, 120:].any()
 
     @pytest.mark.parametrize("obs", ["float32", "uint8"])
-    def test_without_states(self, three, cache, obs):
-        one, two = (load_icrl4aht(three[0] / name, obs=obs, cache=cache) for name in ("states", "observations"))
+    def test_releases_with_and_without_states_give_equal_batches(self, three_layouts, cache, obs):
+        one, two = (load_icrl4aht(three_layouts[0] / name, obs=obs, cache=cache) for name in ("states", "observations"))
         assert_equal(one.ad(batch_size=16, length=130)[0], two.ad(batch_size=16, length=130)[0])
         batch = two.dpt(batch_size=16, context=30)[0]
         assert batch.layouts is None
@@ -114,15 +114,15 @@ class TestOptions:
         ("episodes", "low", "high"),
         [((0, 2), 0, 40), ((-3, None), 60, 120), ((2, 4), 40, 80), ((None, -5), 0, 20)],
     )
-    def test_draws_stay_in_the_episode_range(self, lite, episodes, low, high):
-        dataset = load_icrl4aht(lite[0], layout="demo_wide", obs="state")  # 6 episodes of 20 steps
+    def test_sampled_steps_stay_in_the_episode_range(self, lite, episodes, low, high):
+        dataset = load_icrl4aht(lite[0], layout="demo_wide", obs="state")  # each history has 6 episodes of 20 steps
         _, starts = dataset.ad(batch_size=200, length=15, episodes=episodes).windows(0)
         assert (starts.min(), starts.max()) == (low, high - 15)
         _, step, _, steps = dataset.dpt(batch_size=50, context=15, order="random", episodes=episodes)._draw(0)
         assert low <= step.min() and step.max() < high
         assert (steps.min(), steps.max()) == (low, high - 1)
 
-    def test_a_range_shorter_than_the_window_is_padded(self, lite):
+    def test_windows_longer_than_the_episode_range_are_padded(self, lite):
         root, written = lite
         for cache in CACHES:
             dataset = load_icrl4aht(root, layout="demo_wide", obs="state", cache=cache)
@@ -145,7 +145,7 @@ class TestOptions:
         late = dataset.ad(batch_size=300, length=10, curriculum=plan, episodes=(0, 2)).windows(99)[1]
         assert (late.min(), late.max()) == (20, 30)
 
-    def test_weights(self, tmp_path):
+    def test_histories_are_sampled_in_proportion_to_weights(self, tmp_path):
         random_release(tmp_path / "a", layouts=("cramped_up",), teammates=1, streams=4)
         dataset = load_icrl4aht(tmp_path / "a", obs="state")
         counts = np.bincount(dataset.ad(batch_size=4000, length=9, weights=[0, 1, 3, 0]).windows(0)[0], minlength=4)
@@ -154,9 +154,9 @@ class TestOptions:
         query, _, context, _ = dataset.dpt(batch_size=400, context=9, weights=[0, 0, 0, 2.5])._draw(0)
         assert set(query) == set(context) == {3}
         uniform = dataset.ad(batch_size=400, length=9, weights="length").windows(0)[0]
-        assert np.bincount(uniform).min() > 60  # equal lengths have equal probability
+        assert np.bincount(uniform).min() > 60  # histories of equal length have equal probability
 
-    def test_large_weights_are_drawn_in_proportion(self, lite):
+    def test_very_large_weights_are_sampled_in_proportion(self, lite):
         """Regression: sums of large weights overflowed, so all windows came from one history."""
         dataset = load_icrl4aht(lite[0], layout="demo_wide")
         weights = np.array([1.0, 2.0, 0.0, 1.0, 1.0, 0.5])
@@ -168,7 +168,7 @@ class TestOptions:
         query, _, context, _ = dataset.dpt(batch_size=100, context=9, weights=[1e308] * 6)._draw(0)
         assert len(set(query.tolist())) == len(set(context.tolist())) == 6
 
-    def test_processes_share_a_batch(self, lite):
+    def test_shares_of_processes_concatenate_to_the_full_batch(self, lite):
         dataset = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8")
         shares = (samplers(dataset, process_index=k, process_count=3) for k in range(3))
         for undivided, *parts in zip(samplers(dataset), *shares, strict=True):
@@ -178,8 +178,7 @@ class TestOptions:
                     np.testing.assert_array_equal(np.concatenate([getattr(batch, name) for batch in batches]), array)
 
     def test_windows_are_uniform_over_histories_and_starts(self, lite):
-        """Pearson's statistic of 60,000 draws into 6 x 101 cells, and of histories and of starts alone: its mean is one
-        less than the cells, its variance twice that."""
+        """Compare Pearson's statistic of 60,000 draws with its expected mean, within five standard deviations."""
         sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=500, length=20, seed=11)
         cells = np.zeros((6, 101))
         for i in range(120):
@@ -193,7 +192,7 @@ class TestOptions:
 
 class TestBuffers:
     @pytest.mark.parametrize("kind", ["lite", "twin"])
-    def test_a_batch_is_written_into_out(self, lite, reconverted_release, kind):
+    def test_batch_is_written_into_the_given_buffers(self, lite, reconverted_release, kind):
         root = lite[0] if kind == "lite" else reconverted_release
         for sampler in samplers(load_icrl4aht(root, layout="demo_wide", obs="uint8")):
             out = sampler.empty()

@@ -1,4 +1,4 @@
-"""Batches: contents equal the histories, and draws are fixed."""
+"""Test that batches equal parts of the histories, and that the draws of a seed never change."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.helpers.random_releases import random_release
 LENGTH = 32
 
 
-def previous(array):
+def shift_by_one_step(array):
     return np.concatenate([[0], array[:-1]])
 
 
@@ -33,9 +33,9 @@ def test_ad_windows_are_slices_of_histories(lite_or_full):
             expected = {
                 "target_actions": arrays["actions"],
                 "dones": arrays["dones"],
-                "prev_actions": previous(arrays["actions"]),
-                "prev_rewards": previous(arrays["rewards"]),
-                "prev_teammate_actions": previous(arrays["teammate_actions"]),
+                "prev_actions": shift_by_one_step(arrays["actions"]),
+                "prev_rewards": shift_by_one_step(arrays["rewards"]),
+                "prev_teammate_actions": shift_by_one_step(arrays["teammate_actions"]),
                 "obs": dataset.history(int(history_id)).obs,
             }
             for name, array in expected.items():
@@ -61,7 +61,7 @@ def test_short_histories_are_padded_at_the_end(lite):
     assert np.argwhere(batch.is_first).tolist() == [[0, 0], [1, 0], [2, 0]]
 
 
-def test_families_of_teammates():
+def test_batches_contain_teammate_families_on_request():
     dataset = load_icrl4aht(layout=["demo_wide", "cramped_up"], obs="state", channels="canonical", split="train")
     sampler = dataset.ad(batch_size=64, length=20, families=True)
     batch, ids = sampler[0], sampler.windows(0)[0]
@@ -128,11 +128,11 @@ def _rows(arrays, *names):
 
 
 def _transitions(arrays):
-    following = _following(arrays)
+    following = _next_states(arrays)
     return _rows(arrays | {"following": following}, "state", "following", "actions", "teammate_actions", "rewards")
 
 
-def _following(arrays):
+def _next_states(arrays):
     """Return the state after each step within its episode."""
     following = np.concatenate([arrays["state"][1:], arrays["state"][:1]])
     following[arrays["dones"]] = arrays["episode_end_state"]
@@ -144,7 +144,7 @@ def _is_slice(window, states):
 
 
 @pytest.mark.parametrize("obs", ["float32", "uint8", "state"])
-def test_fields_dtypes_and_shapes(lite, obs):
+def test_batch_fields_have_the_specified_dtypes_and_shapes(lite, obs):
     dataset = load_icrl4aht(lite[0], layout="demo_wide", obs=obs)
     shape = (record_size(get_layout("demo_wide")),) if obs == "state" else (5, 5, 45)
     dtypes = {
@@ -167,14 +167,14 @@ def test_fields_dtypes_and_shapes(lite, obs):
         assert batch.describe().splitlines()[0].split()[:2] == [next(iter(found)), dtypes["obs"]]
 
 
-def test_draws_equal_the_stored_ones(lite):
-    """Saved batch numbers must stay valid, so the windows of one seed are fixed here."""
+def test_windows_of_a_seed_never_change(lite):
+    """Saved batch numbers must stay valid in later versions, so the windows of a seed are fixed."""
     ids, starts = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=6, length=20, seed=0).windows(0)
     assert ids.tolist() == [6, 7, 6, 9, 9, 7]
     assert starts.tolist() == [95, 99, 25, 19, 71, 13]
 
 
-def test_length_and_iteration(lite):
+def test_sampler_length_is_the_number_of_iterated_batches(lite):
     sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=4, length=30)
     assert len(sampler) == 720 // 120 == len(list(sampler))
 
@@ -184,13 +184,13 @@ def test_a_random_context_may_be_longer_than_a_history(lite):
     assert dataset.dpt(batch_size=2, context=121, order="random")[0].context_actions.shape == (2, 121)
 
 
-def test_sampling_from_episodes_of_one_step(tmp_path):
+def test_contexts_can_be_sampled_from_episodes_of_one_step(tmp_path):
     random_release(tmp_path / "r", layouts=("cramped_up",), episodes=9, length=1)
     batch = load_icrl4aht(tmp_path / "r").dpt(batch_size=4, context=9)[0]
     assert batch.context_next_obs.shape == (4, 9, 5, 5, 35)
 
 
-def test_a_batch_larger_than_memory_is_refused_before_it_is_made(lite):
+def test_batch_larger_than_free_memory_is_refused(lite):
     """Regression: too large batches raised NumPy's MemoryError or killed the process."""
     dataset, size = load_icrl4aht(lite[0], layout="demo_wide"), 10**13
     message = rf"batch_size = {size}, (length|context) = 100: .*: takes [\d,]+ GB of memory, more than is free: read"
@@ -201,7 +201,7 @@ def test_a_batch_larger_than_memory_is_refused_before_it_is_made(lite):
 
 
 def test_mixed_splits_cause_a_warning(two_sources):
-    """Unfiltered selections contain validation histories."""
+    """A selection without a split filter contains training and validation histories."""
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide")
     with pytest.warns(
         MixedSplitsWarning, match=r"several splits, train \(14\), validation \(6\): .*split=\"train\""

@@ -1,4 +1,4 @@
-"""File locks exclude other holders although the lock file is removed after use."""
+"""Test that file locks exclude other holders although the lock file is removed after use."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from filelock import Timeout
 from icrl4aht_data.utils.files import process_lock
 
 
-def count(folder: Path, times: int) -> None:
-    """Increment the number in a file slowly, so a broken lock would lose increments."""
+def increment_slowly(folder: Path, times: int) -> None:
+    """Increment the number in a file slowly, so that a broken lock would lose increments."""
     path = folder / "number.txt"
     for _ in range(times):
         with process_lock(folder / "locks" / "below" / ".number.lock"):
@@ -22,9 +22,9 @@ def count(folder: Path, times: int) -> None:
             path.write_text(str(number + 1))
 
 
-def test_a_removed_lock_file_still_excludes_others(tmp_path):
+def test_lock_excludes_other_threads_although_its_file_is_removed(tmp_path):
     (tmp_path / "number.txt").write_text("0")
-    threads = [threading.Thread(target=count, args=(tmp_path, 25)) for _ in range(4)]
+    threads = [threading.Thread(target=increment_slowly, args=(tmp_path, 25)) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -33,7 +33,7 @@ def test_a_removed_lock_file_still_excludes_others(tmp_path):
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["below", "locks", "number.txt"]
 
 
-def test_a_held_lock_is_waited_for_or_reported(tmp_path):
+def test_held_lock_raises_timeout_without_waiting(tmp_path):
     path = tmp_path / ".run.lock"
     with process_lock(path):
         assert path.exists()

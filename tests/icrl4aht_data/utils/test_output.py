@@ -1,4 +1,4 @@
-"""Output of commands: existing files are replaced only on demand, links and folders never."""
+"""Test output checks: existing files are replaced only on request, links and folders never."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import check_output
 
 
-def test_a_file_is_replaced_on_demand(tmp_path):
+def test_check_output_allows_replacing_files_only_on_request(tmp_path):
     path = tmp_path / "file.png"
     check_output(path, overwrite=False)
     path.write_bytes(b"")
@@ -23,7 +23,7 @@ def test_a_file_is_replaced_on_demand(tmp_path):
             check_output(tmp_path / f"{name}.png", overwrite=True)
 
 
-def test_files_of_a_folder(tmp_path):
+def test_check_output_checks_the_named_files_of_a_folder(tmp_path):
     check_output(tmp_path / "new", False, ["report.md"])
     check_output(tmp_path, False, ["report.md"])
     (tmp_path / "notes.md").write_text("mine")

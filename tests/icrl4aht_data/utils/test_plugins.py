@@ -1,4 +1,4 @@
-"""Plugins registered by entry points: found by name, imported on demand, clear errors."""
+"""Test plugins registered by entry points: found by name, imported on demand, with clear errors."""
 
 from __future__ import annotations
 
@@ -65,17 +65,17 @@ POINTS = {
 
 
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory) -> Path:
-    """Return a package with layouts, a teammate and methods, some of them broken."""
+def plugin_folder(tmp_path_factory) -> Path:
+    """Return the folder of a package with layouts, a teammate and methods, some of which are broken."""
     return write_package(tmp_path_factory.mktemp("site"), "rooms", {"maps": MAPS, "methods": METHODS}, POINTS)
 
 
-def clashing(folder: Path, name: str, layout: str) -> Path:
+def write_clashing_package(folder: Path, name: str, layout: str) -> Path:
     return write_package(folder, name, {}, {"icrl4aht.layouts": {layout: "json:loads"}})
 
 
-def test_a_registered_layout_is_known(rooms, tmp_path):
-    with installed(rooms):
+def test_registered_layout_can_be_used_by_name(plugin_folder, tmp_path):
+    with installed(plugin_folder):
         layout = get_layout("plain_room")
         assert layout is get_layout("plain_room")
         task = make_task("layout", "test", "plain_room", heuristic_teammate("utility_greedy", "default", 0), 0)
@@ -83,20 +83,20 @@ def test_a_registered_layout_is_known(rooms, tmp_path):
         random_release(tmp_path / "release", layouts=("plain_room",))
         assert verify_release(tmp_path / "release", level="deep").ok
         assert load_icrl4aht(tmp_path / "release", layout="plain_room").ad(batch_size=2, length=10)[0].obs.shape[0] == 2
-    # The release carries the layout, so a process without the package that registers it reads the release.
+    # The release stores the layout, so a process without the plugin package can read the release.
     assert load_icrl4aht(tmp_path / "release").layouts[0].rows == layout.rows
 
 
-def test_plugins_do_not_change_the_benchmark(rooms):
+def test_plugins_do_not_change_the_benchmark(plugin_folder):
     before = CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES]
-    with installed(rooms):
+    with installed(plugin_folder):
         assert before == (CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES])
         assert [layout_number(name) for name in LAYOUT_NAMES] == list(range(10))
         assert 10 <= layout_number("plain_room") == layout_number("plain_room") < 20_000
 
 
-def test_more_ingredients_than_canonical_channels(rooms):
-    with installed(rooms), pytest.raises(OptionError, match=r"layout spicy_room: channels .*ingredient_7"):
+def test_layout_with_unknown_ingredients_has_no_canonical_channels(plugin_folder):
+    with installed(plugin_folder), pytest.raises(OptionError, match=r"layout spicy_room: channels .*ingredient_7"):
         canonical_positions(get_layout("spicy_room"))
 
 
@@ -108,17 +108,17 @@ def test_more_ingredients_than_canonical_channels(rooms):
         ("other_alias", "expected name and alias 'other_alias', found name 'other_alias' and alias 'other_alias_v1'"),
     ],
 )
-def test_an_unusable_layout_is_an_error_when_used(rooms, name, problem):
-    with installed(rooms):
+def test_broken_layout_plugin_raises_error_when_used(plugin_folder, name, problem):
+    with installed(plugin_folder):
         with pytest.raises(UnknownNameError, match=name):
             get_layout("missing")
         with pytest.raises(PluginError, match=f"^package rooms 0.1, entry point icrl4aht.layouts: {name} .*{problem}"):
             get_layout(name)
 
 
-def test_unusable_teammates_and_methods(rooms):
+def test_broken_teammate_and_method_plugins_raise_errors(plugin_folder):
     world = overcooked_world([LAYOUTS["demo_wide"]])
-    with installed(rooms):
+    with installed(plugin_folder):
         with pytest.raises(PluginError, match=r"rooms 0.1.*expected kind 'greedy_too', found 'utility_greedy'"):
             heuristic_teammate("greedy_too", "default", 0)
         assert get_method("my_ad")(ModelOptions(), world).label == get_method("ad")(ModelOptions(), world).label
@@ -143,9 +143,9 @@ def test_unusable_teammates_and_methods(rooms):
         ({"one": "a room"}, "a room: expected a name of letters"),
     ],
 )
-def test_clashes(registered, message, tmp_path):
+def test_plugins_with_clashing_or_invalid_names_raise_errors(registered, message, tmp_path):
     for name, layout in registered.items():
-        clashing(tmp_path, name, layout)
+        write_clashing_package(tmp_path, name, layout)
     with installed(tmp_path):
         with pytest.raises(PluginError, match=message):
             get_layout("elsewhere")

@@ -1,4 +1,4 @@
-"""Progress without a terminal: plain lines, timed by a fake clock."""
+"""Test progress output: lines without a terminal, timed by a fake clock, and bars on terminals."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from icrl4aht_data.utils import progress
 from icrl4aht_data.utils.progress import counted, progress_bars, progress_line
 
 
-class Clock:
-    """A fake clock that only `wait` advances."""
+class FakeClock:
+    """Fake clock that advances only when `wait` is called."""
 
     now = 0.0
 
@@ -32,8 +32,8 @@ class Clock:
         (30, "9 of 1,000 steps (1 %) after 4 min, 2.0 per minute, 8 h 16 min left; loss 1.5"),
     ],
 )
-def test_a_line_has_count_speed_and_time_left(seconds, expected):
-    clock = Clock()
+def test_progress_line_has_count_speed_and_time_left(seconds, expected):
+    clock = FakeClock()
     bars = Progress(get_time=clock, speed_estimate_period=math.inf)
     number = bars.add_task("x", total=1000, note="")
     for done in range(10):
@@ -42,8 +42,8 @@ def test_a_line_has_count_speed_and_time_left(seconds, expected):
     assert progress_line(bars.tasks[0], "steps", False) == f"x: {expected}"
 
 
-def test_resumed_work_does_not_count_as_speed():
-    clock = Clock()
+def test_progress_speed_excludes_work_before_a_resume():
+    clock = FakeClock()
     bars = Progress(get_time=clock, speed_estimate_period=math.inf)
     number = bars.add_task("x", total=1000, note="")
     bars.update(number, completed=900)
@@ -54,7 +54,7 @@ def test_resumed_work_does_not_count_as_speed():
     assert progress_line(bars.tasks[0], "", False) == expected
 
 
-def test_a_thread_prints_lines_on_stderr_while_a_step_takes_long(monkeypatch, capsys):
+def test_progress_lines_are_printed_during_long_steps(monkeypatch, capsys):
     monkeypatch.setattr(progress, "FIRST_LINE_SECONDS", 0.02)
     with progress_bars(of_bytes=True) as show:
         show("finished", 4, 4)
@@ -69,7 +69,7 @@ def test_a_thread_prints_lines_on_stderr_while_a_step_takes_long(monkeypatch, ca
     assert "progress" not in {thread.name for thread in threading.enumerate()}
 
 
-def test_terminals_get_bars(monkeypatch, capsys):
+def test_progress_bars_are_shown_on_terminals(monkeypatch, capsys):
     monkeypatch.setenv("FORCE_COLOR", "1")
     with progress_bars(unit="steps") as show:
         advance = counted(show, "ad", 4)
@@ -78,7 +78,7 @@ def test_terminals_get_bars(monkeypatch, capsys):
     assert "ad: loss 1.234" in capsys.readouterr().err
 
 
-def test_threads_advance_one_bar_together():
+def test_threads_can_advance_one_progress_bar():
     shown = []
     advance = counted(lambda *bar: shown.append(bar), "x", 400)
     threads = [threading.Thread(target=lambda: [advance(1) for _ in range(100)]) for _ in range(4)]

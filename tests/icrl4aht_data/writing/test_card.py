@@ -1,4 +1,4 @@
-"""The card of a release: facts, README.md and the long tables in card.json."""
+"""Test the card of a release: its facts, README.md, and the long tables in card.json."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ Tasks = list[tuple[Task, Provenance, list[tuple[int, float, float]]]]
 Change = Callable[[Provenance], Provenance]
 
 
-def drawn(layout: str, family: str, theta_id: int, split: str = "train", seed: int = 0) -> Task:
+def heuristic_task(layout: str, family: str, theta_id: int, split: str = "train", seed: int = 0) -> Task:
     teammate = {"kind": "heuristic", "family": KINDS_OF[family], "theta_id": theta_id}
     return make_task("teammate", split, layout, teammate | {"base_seed": int(split != "train"), "theta": {}}, seed)
 
 
-def made(
+def make_provenance(
     source: str, oracle: float = 40.0, distance: float = 0.25, behaviour: int | None = 0, nearest: str = "H3/t1"
 ) -> Provenance:
     expert = ExpertLabels(None if source == "noise" else "0" * 64, "greedy", None, oracle)
@@ -58,21 +58,21 @@ def made(
 
 
 def four_tasks() -> Tasks:
-    """Return two learners and noise with one teammate, a validation teammate, and coord_simple."""
+    """Return PPO and noise tasks with one teammate, a task with a validation teammate, and a task on coord_simple."""
     return [
-        (drawn("demo_wide", "H3", 12), made("ppo"), [(0, 0.0, 20.0), (1, 0.0, 4.0)]),
-        (drawn("demo_wide", "H3", 12, seed=1), made("noise"), [(0, 1.0, 41.0), (0, 0.0, 45.0)]),
-        (drawn("demo_wide", "H3", 7, "validation"), made("noise", 30, 0.02, 4), [(0, 2.0, 30.0)]),
-        (drawn("coord_simple", "H1", 0), made("ppo", 1.5, 0.5, None, "H1/t0"), [(0, 10.0, 10.0)]),
+        (heuristic_task("demo_wide", "H3", 12), make_provenance("ppo"), [(0, 0.0, 20.0), (1, 0.0, 4.0)]),
+        (heuristic_task("demo_wide", "H3", 12, seed=1), make_provenance("noise"), [(0, 1.0, 41.0), (0, 0.0, 45.0)]),
+        (heuristic_task("demo_wide", "H3", 7, "validation"), make_provenance("noise", 30, 0.02, 4), [(0, 2.0, 30.0)]),
+        (heuristic_task("coord_simple", "H1", 0), make_provenance("ppo", 1.5, 0.5, None, "H1/t0"), [(0, 10.0, 10.0)]),
     ]
 
 
 @pytest.fixture
-def write(lite, tmp_path) -> Callable[..., dict[str, Any]]:
-    """Write the files of meta/ for a card and return its facts; `change` edits each provenance."""
+def write_meta(lite, tmp_path) -> Callable[..., dict[str, Any]]:
+    """Return a function that writes meta/ and returns the facts of its card; `change` edits each provenance."""
     like = read_index(lite[0]).entries[0]
 
-    def write(tasks: Tasks | None = None, change: Change = lambda of: of, **fields: Any) -> dict[str, Any]:
+    def write_meta(tasks: Tasks | None = None, change: Change = lambda of: of, **fields: Any) -> dict[str, Any]:
         tasks, entries = four_tasks() if tasks is None else tasks, []
         for task, of_task, histories in tasks:
             for stream, (learner, start, end) in enumerate(histories):
@@ -92,11 +92,11 @@ def write(lite, tmp_path) -> Callable[..., dict[str, Any]]:
         write_json(tmp_path / PROVENANCE, {task.task_id: change(of_task).to_json() for task, of_task, _ in tasks})
         return card_facts(tmp_path)
 
-    return write
+    return write_meta
 
 
-def test_learning_by_layout_source_and_split(write):
-    content = write()
+def test_card_lists_learning_by_layout_source_and_split(write_meta):
+    content = write_meta()
     rows = [tuple(row.values()) for row in content["learning"]]
     assert rows == [
         ("demo_wide", "ppo", "train", 2, 0.0, 12.0, None, 0.5),
@@ -107,8 +107,8 @@ def test_learning_by_layout_source_and_split(write):
     assert "| demo_wide | train | 0.0 to 12.0 (2) | 0.5 to 43.0 (2) |" in render_card(content)
 
 
-def test_long_tables_move_to_card_json(write, tmp_path):
-    write()
+def test_long_tables_are_written_to_card_json(write_meta, tmp_path):
+    write_meta()
     write_card(tmp_path)
     tables = json.loads((tmp_path / "card.json").read_text())
     mates = {(row["layout"], row["teammate"]): row for row in tables["teammates"]}
@@ -121,36 +121,37 @@ def test_long_tables_move_to_card_json(write, tmp_path):
     assert len(tables["learning"]) == 4
 
 
-def test_teammates_that_act_like_the_test_are_named(write):
-    content = write()
+def test_card_names_teammates_that_behave_like_test_teammates(write_meta):
+    content = write_meta()
     assert (content["drawn"], content["tested"], content["alike"]) == (["H1", "H3"], [], [])
     assert content["drawn_distance"] == 0.02, "the validation teammate's"
     assert "Hamming distance to every test teammate of the layout is 0.02 or more." in render_card(content)
     tasks = four_tasks()
-    tasks[0] = (tasks[0][0], made("ppo", distance=0.006, nearest="H1/t0"), tasks[0][2])
-    tasks[3] = (tasks[3][0], made("ppo", 1.5, 0.01, 0, "H1/t3"), tasks[3][2])
-    content = write(tasks)
+    tasks[0] = (tasks[0][0], make_provenance("ppo", distance=0.006, nearest="H1/t0"), tasks[0][2])
+    tasks[3] = (tasks[3][0], make_provenance("ppo", 1.5, 0.01, 0, "H1/t3"), tasks[3][2])
+    content = write_meta(tasks)
     assert (content["drawn"], content["tested"]) == (["H3"], ["H1"])
     assert content["alike"] == ["H3 on demo_wide like H1/t0"]
     card = render_card(content)
     assert "(distance below 0.02): H3 on demo_wide like H1/t0." in card and "0.02 or more, with the exceptions" in card
 
 
-def test_the_bundled_card_is_short_and_current():
+def test_bundled_card_is_short_and_up_to_date():
     content = card_facts(MINI)
     assert (MINI / "README.md").read_text() == render_card(content)
-    words = [word for word in (MINI / "README.md").read_text().split() if word.strip("|:-")]  # not lines of tables
+    # The separator lines of tables do not count as words.
+    words = [word for word in (MINI / "README.md").read_text().split() if word.strip("|:-")]
     assert len(words) <= 2500
 
 
-def test_histories_of_people_change_the_datasheet():
+def test_card_of_human_histories_states_personal_data():
     assert rai_texts({"noise"})["personal_sensitive_information"] == "None."
     rai = rai_texts({"noise", "human"})
     assert "Pseudonyms" in rai["personal_sensitive_information"] and rai.keys() == rai_texts({"noise"}).keys()
     assert f"* Personal data: {rai['personal_sensitive_information']}" in render_card(card_facts(MINI) | {"rai": rai})
 
 
-def test_every_field_is_described():
+def test_card_texts_describe_every_field():
     assert list(card_texts("arrays")) == list(FIELDS)
     assert list(card_texts("index")) == list(ENTRY_HINTS)
     assert list(episode_texts()) == list(EPISODE_COLUMNS)

@@ -1,4 +1,4 @@
-"""Combining releases: histories, equal bytes and refused inputs."""
+"""Test combining releases: equal histories, equal bytes and refused inputs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def parts(request, tmp_path_factory) -> list[Path]:
     return [folder / "a", folder / "b"]
 
 
-def test_histories_are_those_of_the_parts(parts, tmp_path):
+def test_combined_histories_equal_those_of_the_inputs(parts, tmp_path):
     arguments = ["combine", *map(str, parts), "--out", str(tmp_path / "out")]
     run_cli(*arguments)
     report = verify_release(tmp_path / "out", level="deep")
@@ -45,13 +45,13 @@ def test_histories_are_those_of_the_parts(parts, tmp_path):
     assert "* 8 histories of " in (tmp_path / "out" / "README.md").read_text()
 
 
-def test_one_release_combines_to_the_same_bytes(parts, tmp_path):
+def test_combining_a_single_release_keeps_its_bytes(parts, tmp_path):
     combine_releases(tmp_path / "out", parts[:1])
     for shard in (parts[0] / "data").rglob("*.h5"):
         assert (tmp_path / "out" / shard.relative_to(parts[0])).read_bytes() == shard.read_bytes()
 
 
-def test_a_selection_is_combined_without_the_other_histories(parts, tmp_path):
+def test_combining_a_selection_excludes_all_other_histories(parts, tmp_path):
     chosen = load_icrl4aht(parts[1], layout="demo_wide")[1:]
     combined = load_icrl4aht(combine_releases(tmp_path / "out", [chosen, parts[0]]))
     assert combined.counts("layout") == {"demo_wide": 2, "coord_simple": 2}
@@ -61,13 +61,13 @@ def test_a_selection_is_combined_without_the_other_histories(parts, tmp_path):
         assert np.array_equal(by_stream[history.entry.env_idx].read("actions"), history.read("actions"))
 
 
-def test_a_task_in_two_releases_is_refused(parts, tmp_path):
+def test_combine_refuses_a_task_that_two_releases_contain(parts, tmp_path):
     with pytest.raises(OptionError, match=r"b: task teammate_train_demo_cook_wide_.* is also in .*b"):
         combine_releases(tmp_path / "out", [parts[1], parts[0], parts[1]])
     assert not (tmp_path / "out").exists()
 
 
-def test_other_kinds_lengths_versions_and_formats_are_refused(tmp_path):
+def test_combine_refuses_different_kinds_lengths_versions_and_formats(tmp_path):
     cases: list[tuple[str, Kind, int]] = [("a", "lite", 20), ("b", "full", 20), ("c", "lite", 10), ("d", "lite", 20)]
     for name, kind, length in cases:
         layout = "coord_simple" if name == "a" else "demo_wide"

@@ -1,4 +1,4 @@
-"""Conversion of releases to other forms and back."""
+"""Test conversion of releases to other forms and back."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from tests.helpers.batches import digest
 
 
 @pytest.fixture(scope="module")
-def published(lite, tmp_path_factory):
-    """Return `lite` converted to the published code's files (read-only)."""
+def published_files(lite, tmp_path_factory):
+    """Return the release `lite`, converted to files of the published code (read-only)."""
     return to_published(load_icrl4aht(lite[0]), tmp_path_factory.mktemp("published") / "files")
 
 
 @pytest.mark.parametrize(("start", "kind"), [("lite", "full"), ("full", "lite"), ("full", "full")])
-def test_full_and_lite(request, tmp_path, start, kind):
+def test_full_and_lite_releases_convert_into_each_other(request, tmp_path, start, kind):
     root, _ = request.getfixturevalue(start)
     to_release(load_icrl4aht(root), tmp_path / "out", kind)
     assert verify_release(tmp_path / "out", level="deep").ok
@@ -39,7 +39,7 @@ def test_full_and_lite(request, tmp_path, start, kind):
     assert (tmp_path / "out" / "meta" / "tasks.jsonl").read_text() == (root / "meta" / "tasks.jsonl").read_text()
 
 
-def test_a_part_of_a_release(lite, tmp_path):
+def test_selection_of_histories_can_be_converted(lite, tmp_path):
     part = load_icrl4aht(lite[0]).select([7, 2])
     to_release(part, tmp_path / "out", "lite")
     out = load_icrl4aht(tmp_path / "out")
@@ -48,10 +48,10 @@ def test_a_part_of_a_release(lite, tmp_path):
         np.testing.assert_array_equal(new.state[:], old.state[:])
 
 
-def test_published_files_are_as_the_paper_says(lite, published):
+def test_published_files_have_the_format_of_the_paper(lite, published_files):
     root, written = lite
-    with h5py.File(published / "histories.h5") as file:
-        for line in (published / "histories_index.jsonl").read_text().splitlines():
+    with h5py.File(published_files / "histories.h5") as file:
+        for line in (published_files / "histories_index.jsonl").read_text().splitlines():
             entry = json.loads(line)
             assert tuple(entry) == PUBLISHED_FIELDS
             group: Any = file[entry["h5_group"]]
@@ -66,8 +66,8 @@ def test_published_files_are_as_the_paper_says(lite, published):
             np.testing.assert_array_equal(group["obs"][()], load_icrl4aht(root).history(entry["history_id"]).obs[:])
 
 
-def test_conversion_round_trips(lite, published, tmp_path):
-    from_published(published, tmp_path / "back", "lite", data_version="0.0.1", kept_steps=20)
+def test_published_files_convert_back_to_the_same_release(lite, published_files, tmp_path):
+    from_published(published_files, tmp_path / "back", "lite", data_version="0.0.1", kept_steps=20)
     assert verify_release(tmp_path / "back", level="deep").ok
     assert digest(tmp_path / "back") == digest(lite[0])
     for name in ("meta/histories.jsonl", "meta/tasks.jsonl", "meta/provenance.json", "meta/info.json"):
@@ -86,34 +86,34 @@ def test_a_release_is_not_written_over_its_source(lite, write):
             write(dataset, target, overwrite=True)
 
 
-def wrong(value: Any) -> Any:
+def untyped(value: Any) -> Any:
     return value
 
 
 @pytest.mark.parametrize(
     "call",
     [
-        lambda ds: to_release(ds, wrong(3), "lite"),
-        lambda ds: to_release(ds, "out", wrong("heavy")),
-        lambda ds: to_published(ds, wrong(None)),
-        lambda ds: to_minari(ds, wrong(b"out-v0")),
-        lambda ds: to_parquet(ds, wrong(3.5)),
-        lambda ds: from_published(wrong(None), "out"),
-        lambda ds: from_published("files", "out", kept_steps=wrong("many")),
+        lambda ds: to_release(ds, untyped(3), "lite"),
+        lambda ds: to_release(ds, "out", untyped("heavy")),
+        lambda ds: to_published(ds, untyped(None)),
+        lambda ds: to_minari(ds, untyped(b"out-v0")),
+        lambda ds: to_parquet(ds, untyped(3.5)),
+        lambda ds: from_published(untyped(None), "out"),
+        lambda ds: from_published("files", "out", kept_steps=untyped("many")),
         lambda ds: combine_releases("out", str(ds.root)),
-        lambda ds: combine_releases("out", [ds.root], wrong(5)),
-        lambda ds: combine_releases(wrong(["out"]), [ds.root]),
-        lambda ds: build_release(ds.root, wrong(5)),
-        lambda ds: upload_release(ds.root, wrong(None)),
-        lambda ds: verify_release(ds.root, level=wrong(3)),
+        lambda ds: combine_releases("out", [ds.root], untyped(5)),
+        lambda ds: combine_releases(untyped(["out"]), [ds.root]),
+        lambda ds: build_release(ds.root, untyped(5)),
+        lambda ds: upload_release(ds.root, untyped(None)),
+        lambda ds: verify_release(ds.root, level=untyped(3)),
     ],
 )
-def test_wrong_arguments_are_errors_of_the_package(lite, tmp_path, monkeypatch, call):
+def test_wrong_arguments_raise_package_errors(lite, tmp_path, monkeypatch, call):
     monkeypatch.chdir(tmp_path)
     with pytest.raises((OptionError, UnknownNameError)):
         call(load_icrl4aht(lite[0]))
     assert not list(tmp_path.iterdir())
 
 
-def test_paths_may_be_texts(lite, tmp_path):
+def test_output_path_may_be_a_string(lite, tmp_path):
     assert to_release(load_icrl4aht(lite[0])[:1], str(tmp_path / "out"), "lite") == tmp_path / "out"

@@ -1,4 +1,4 @@
-"""Episodes as Parquet files: typed rows that `datasets` streams, from which observations are rendered."""
+"""Test episodes as Parquet files: `datasets` streams typed rows, and observations are rendered from rows."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ STEPS, WIDTH = 20, 24
 
 
 @pytest.fixture(scope="module")
-def built(two_sources, tmp_path_factory) -> Path:
-    """Build `two_sources` for publication (read-only)."""
+def built_release(two_sources, tmp_path_factory) -> Path:
+    """Return the release `two_sources`, built for publication (read-only)."""
     return build_release(two_sources[0], tmp_path_factory.mktemp("built") / "release")
 
 
 @pytest.fixture
-def dataset(built) -> Dataset:
-    return load_icrl4aht(built)
+def dataset(built_release) -> Dataset:
+    return load_icrl4aht(built_release)
 
 
-def stream(built: Path, split: str) -> Any:
-    return datasets.load_dataset(str(built), "episodes", split=split, streaming=True)
+def stream_episodes(built_release: Path, split: str) -> Any:
+    return datasets.load_dataset(str(built_release), "episodes", split=split, streaming=True)
 
 
-def in_file_order(dataset: Dataset, split: str) -> list[tuple[History, Episode]]:
+def episodes_in_file_order(dataset: Dataset, split: str) -> list[tuple[History, Episode]]:
     """Return the episodes of a split with their histories, ordered by layout name like the files."""
     layouts = sorted(layout.name for layout in dataset.filter(split=split).layouts)
     parts = [dataset.filter(split=split, layout=name) for name in layouts]
@@ -48,8 +48,10 @@ def in_file_order(dataset: Dataset, split: str) -> list[tuple[History, Episode]]
 
 
 @pytest.mark.parametrize("split", ["train", "validation"])
-def test_streamed_rows_are_the_episodes(built, dataset, split):
-    for row, (history, episode) in zip(stream(built, split), in_file_order(dataset, split), strict=True):
+def test_streamed_rows_equal_the_episodes(built_release, dataset, split):
+    for row, (history, episode) in zip(
+        stream_episodes(built_release, split), episodes_in_file_order(dataset, split), strict=True
+    ):
         entry = history.entry
         names = ("history_id", "task_id", "track", "split", "layout", "teammate_family", "teammate_kind", "source")
         assert [row[name] for name in (*names, "learner")] == [getattr(entry, name) for name in (*names, "learner")]
@@ -66,12 +68,12 @@ def test_streamed_rows_are_the_episodes(built, dataset, split):
 class TestObservations:
     @pytest.mark.parametrize("obs", ["float32", "uint8"])
     @pytest.mark.parametrize("channels", ["own", "canonical"])
-    def test_observations_equal_those_of_the_histories(self, built, dataset, channels, obs):
+    def test_rendered_observations_equal_those_of_the_histories(self, built_release, dataset, channels, obs):
         """Render single rows of lists, and batches of arrays."""
         opened = dataset.filter(split="train").with_options(obs=obs, channels=channels)
         for layout in opened.layouts:
             expected = [episode.obs for history in opened.filter(layout=layout.name) for episode in history.episodes]
-            rows = stream(built, "train").filter(lambda row, name=layout.name: row["layout"] == name)
+            rows = stream_episodes(built_release, "train").filter(lambda row, name=layout.name: row["layout"] == name)
             for seen, row in zip(expected, rows, strict=True):
                 found = render_observations(row, channels=channels, obs=obs)
                 assert found.dtype == obs
@@ -79,16 +81,16 @@ class TestObservations:
             (batch,) = rows.with_format("numpy").batch(1000)
             np.testing.assert_array_equal(render_observations(batch, channels=channels, obs=obs), expected)
 
-    def test_rows_of_several_layouts(self, built, dataset):
-        by_layout = {row["layout"]: row for row in stream(built, "train")}
+    def test_rows_of_several_layouts_need_canonical_channels(self, built_release, dataset):
+        by_layout = {row["layout"]: row for row in stream_episodes(built_release, "train")}
         assert len(by_layout) > 1
         rows = list(by_layout.values())
         assert render_observations(rows, channels="canonical").shape == (len(rows), STEPS, 5, 5, 46)
         with pytest.raises(OptionError, match=r'expected one shape, found .*: give .* take channels="canonical"'):
             render_observations(rows)
 
-    def test_invalid_rows(self, built):
-        row = next(iter(stream(built, "train")))
+    def test_invalid_rows_raise_errors(self, built_release):
+        row = next(iter(stream_episodes(built_release, "train")))
         wrong: list[tuple[type[Exception], str, Any, dict[str, Any]]] = [
             (UnknownNameError, "unknown channels", row, {"channels": "all"}),
             (OptionError, "found none: give at least one row", [], {}),
@@ -105,10 +107,10 @@ class TestObservations:
                 render_observations(rows, **options)
 
 
-def test_hugging_face_datasets_in_memory_have_the_same_rows(built, dataset, tmp_path, monkeypatch):
+def test_hf_episodes_have_the_same_rows_as_streamed_files(built_release, dataset, tmp_path, monkeypatch):
     monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path)
     rows: Any = hf_episodes(dataset.filter(split="validation"))
-    streamed = stream(built, "validation")
+    streamed = stream_episodes(built_release, "validation")
     assert rows.features == streamed.features
     by_episode = {(row["history_id"], row["episode"]): row for row in streamed}
     assert len(by_episode) == len(rows)

@@ -1,4 +1,4 @@
-"""Writing to a full disk: the error names the disk, and no partial files remain."""
+"""Test writing to a full disk: the error names the disk, and no partial files remain."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from tests.robustness.limits import PAGE, can_mount, file_size_limit, small_disk
 needs_disks = pytest.mark.skipif(not can_mount(), reason="this user may not mount a small disk")
 
 
-def test_a_limit_on_the_size_of_files(lite, tmp_path):
-    """Shards are not written by libhdf5, because it may crash when a file cannot be closed."""
+def test_file_size_limit_raises_error_with_the_file_name(lite, tmp_path):
+    """libhdf5 may crash when a file cannot be closed, so shards are written without libhdf5."""
     dataset = load_icrl4aht(lite[0])
     for limit in (PAGE, 10 * PAGE):
         with file_size_limit(limit), pytest.raises(OSError, match=r"File too large.*histories\.h5") as error:
@@ -30,7 +30,7 @@ def test_a_limit_on_the_size_of_files(lite, tmp_path):
 
 
 @needs_disks
-def test_a_full_disk_is_named(lite, tmp_path):
+def test_full_disk_raises_error_that_names_the_disk(lite, tmp_path):
     dataset, disk = load_icrl4aht(lite[0]), tmp_path / "disk"
     writers = {
         "files": lambda target: to_published(dataset, target),

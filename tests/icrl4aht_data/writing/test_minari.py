@@ -1,4 +1,4 @@
-"""Conversion to Minari datasets, read back with Minari."""
+"""Test conversion to Minari datasets, which are read back with Minari."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ EPISODES, STEPS = 6, 20
 
 
 @pytest.fixture(scope="module")
-def converted(lite, tmp_path_factory):
-    """Return all histories of `lite` as Minari data; its two layouts have unequal observation shapes."""
+def minari_folder(lite, tmp_path_factory):
+    """Return the folder of a Minari dataset of the release `lite`, on two layouts of unequal observation shapes."""
     folder = tmp_path_factory.mktemp("minari")
     return to_minari(load_icrl4aht(lite[0]), folder / "lite-v0")
 
 
-def test_minari_opens_every_episode(lite, converted, monkeypatch):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(converted.parent))
+def test_minari_reads_the_arrays_of_every_episode(lite, minari_folder, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(minari_folder.parent))
     opened = minari.load_dataset("lite-v0")
     release = load_icrl4aht(lite[0], obs="uint8", channels="canonical")
     assert opened.total_episodes == EPISODES * len(release)
@@ -52,8 +52,8 @@ def test_minari_opens_every_episode(lite, converted, monkeypatch):
     assert (facts["history"], facts["episode"], facts["task_id"]) == (1, 0, release.entries[1].task_id)
 
 
-def test_a_dataset_of_one_task_has_its_environment(tmp_path):
-    """Minari and the release recover equal environments."""
+def test_minari_dataset_of_one_task_recovers_its_environment(tmp_path):
+    """Minari recovers the task's environment from the converted dataset."""
     release = load_icrl4aht(MINI, layout="demo_wide", source="noise", teammate_family="H3")
     part = release.filter(task_id=release.entries[0].task_id)[:1]
     to_minari(part, tmp_path / "one-v0")
@@ -65,8 +65,8 @@ def test_a_dataset_of_one_task_has_its_environment(tmp_path):
     assert env.observation_space.shape == (5, 5, 45)
 
 
-def test_other_facts_are_in_minaris_metadata(lite, converted):
-    about = json.loads((converted / "data" / "metadata.json").read_text())["icrl4aht"]
+def test_minari_metadata_contains_tasks_and_provenance(lite, minari_folder):
+    about = json.loads((minari_folder / "data" / "metadata.json").read_text())["icrl4aht"]
     release = load_icrl4aht(lite[0])
     assert (about["data_version"], about["kept_steps"]) == ("0.0.1", STEPS)
     assert [about["histories"][entry.history_id]["task_id"] for entry in release.entries] == release.column(
@@ -75,22 +75,22 @@ def test_other_facts_are_in_minaris_metadata(lite, converted):
     assert {task["task_id"] for task in about["tasks"]} == about["provenance"].keys() == set(release.column("task_id"))
 
 
-def test_minari_shows_author_size_and_why_there_is_no_environment(converted):
-    opened = minari.MinariDataset(converted / "data")
+def test_minari_metadata_explains_why_no_environment_is_stored(minari_folder):
+    opened = minari.MinariDataset(minari_folder / "data")
     assert opened.env_spec is None
     shown = opened.storage.metadata
     assert shown["author"] == {"The icrl4aht-data authors"} and shown["dataset_size"] > 0
     assert "4 tasks; there is no single environment to recover" in shown["description"]
 
 
-def test_the_command(lite, tmp_path):
+def test_convert_command_writes_and_overwrites_minari_datasets(lite, tmp_path):
     made = ["convert", "--quiet", lite[0], "--layout", "demo_wide", "--to", "minari", "--out", tmp_path / "wide-v0"]
     run_cli(*made)
     run_cli(*made, "--overwrite")
     assert len(minari.MinariDataset(tmp_path / "wide-v0" / "data")) == 6 * EPISODES
 
 
-def test_wrong_selections_and_names_are_errors(lite, converted_release, tmp_path):
+def test_to_minari_refuses_missing_states_and_invalid_names(lite, converted_release, tmp_path):
     with pytest.raises(NotStoredError, match="has observations only"):
         to_minari(load_icrl4aht(converted_release), tmp_path / "some-v0")
     with pytest.raises(OptionError, match="expected a folder with a Minari name, such as demo_wide-v0"):

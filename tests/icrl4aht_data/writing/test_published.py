@@ -1,4 +1,4 @@
-"""Files of the published code: family names, 4 x 5 views, duplicates, interrupted conversions."""
+"""Test files of the published code: family names, 4 x 5 views, duplicates and interrupted conversions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.helpers.random_releases import random_release
 from tests.helpers.spoiled import change_file
 
 
-def relabel(source: Path, target: Path, changes: dict[int, dict[str, Any]]) -> Path:
+def copy_with_index_changes(source: Path, target: Path, changes: dict[int, dict[str, Any]]) -> Path:
     """Copy published files with changed index lines."""
     shutil.copytree(source, target)
     change_file(target / HISTORIES_INDEX, lambda lines: [lines[number].update(changes[number]) for number in changes])
@@ -44,9 +44,9 @@ def relabel(source: Path, target: Path, changes: dict[int, dict[str, Any]]) -> P
         ("H2", "some_variant", ("H2", "some_variant")),
     ],
 )
-def test_names_of_the_published_code(published_folder, tmp_path, family, kind, expected):
+def test_family_names_of_the_published_code_are_converted(published_folder, tmp_path, family, kind, expected):
     names = {"teammate_family": family, "teammate_kind": kind}
-    files = relabel(published_folder[0], tmp_path / "files", {2: names})
+    files = copy_with_index_changes(published_folder[0], tmp_path / "files", {2: names})
     from_published(files, tmp_path / "out", kept_steps=KEPT)
     (entry,) = load_icrl4aht(tmp_path / "out", layout="coord_simple").entries
     assert (entry.teammate_family, entry.teammate_kind) == expected
@@ -55,7 +55,7 @@ def test_names_of_the_published_code(published_folder, tmp_path, family, kind, e
 
 @pytest.fixture(scope="module")
 def short_views(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]], np.ndarray]:
-    """Return files with 4 x 5 views of cramped_up, the history, and the complete views (read-only)."""
+    """Return files with 4 x 5 views of cramped_up, their histories, and the complete views (read-only)."""
     folder = tmp_path_factory.mktemp("short")
     written = random_release(folder / "release", layouts=("cramped_up",), teammates=1, streams=2)
     dataset = load_icrl4aht(folder / "release", obs="uint8")
@@ -70,7 +70,7 @@ def short_views(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]
     return folder / "files", written, complete
 
 
-def test_short_views_are_completed(short_views, tmp_path):
+def test_short_views_are_padded_to_5_by_5(short_views, tmp_path):
     files, written, complete = short_views
     assert from_published(files, tmp_path / "out", kept_steps=20) == "observations"
     dataset = load_icrl4aht(tmp_path / "out", obs="uint8")
@@ -79,7 +79,8 @@ def test_short_views_are_completed(short_views, tmp_path):
     np.testing.assert_array_equal(found[:, :, :4], complete[:, :, :4])
     fixed = fixed_channels(get_layout("cramped_up"))
     np.testing.assert_array_equal(found[..., fixed], complete[..., fixed])
-    outside = ~complete[:, :, 4, :, fixed].any(axis=(-2, -1))  # the ego is in the lower row
+    # If the ego is in the lower row, the last row of the view is outside the map.
+    outside = ~complete[:, :, 4, :, fixed].any(axis=(-2, -1))
     assert 0.1 < outside.mean() < 0.9
     assert not found[:, :, 4][outside].any() and not complete[:, :, 4][outside].any()
     np.testing.assert_array_equal(dataset[1].actions[:], written[1]["actions"])
@@ -90,8 +91,8 @@ def test_short_views_are_completed(short_views, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
-def test_short_views_with_states(short_views, tmp_path, kind):
-    """States determine the missing rows; changes of recorded rows are found."""
+def test_short_views_are_completed_from_states(short_views, tmp_path, kind):
+    """Missing rows are rendered from states, and changes of recorded rows are found."""
     files, _, complete = short_views
     shutil.copytree(files, tmp_path / "files")
     dataset = load_icrl4aht(files.parent / "release")
@@ -112,7 +113,7 @@ def test_short_views_with_states(short_views, tmp_path, kind):
         from_published(tmp_path / "files", tmp_path / "again", kind, kept_steps=20)
 
 
-def test_short_views_of_nothing_are_refused(short_views, tmp_path):
+def test_short_views_that_match_no_position_are_refused(short_views, tmp_path):
     shutil.copytree(short_views[0], tmp_path / "files")
     with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
         stored: Any = file["/1/obs"]
@@ -121,7 +122,7 @@ def test_short_views_of_nothing_are_refused(short_views, tmp_path):
         from_published(tmp_path / "files", tmp_path / "out", kept_steps=20)
 
 
-def test_duplicates_and_contradictions_are_refused(published_folder, tmp_path):
+def test_duplicate_and_contradictory_index_lines_are_refused(published_folder, tmp_path):
     cases = {
         "line 2: group '0' is already used by line 1": {1: {"h5_group": "0"}},
         "line 2: stream 10 of task 'task_a' is already used by line 1": {1: {"env_idx": 10}},
@@ -134,13 +135,13 @@ def test_duplicates_and_contradictions_are_refused(published_folder, tmp_path):
         },
     }
     for number, (message, changes) in enumerate(cases.items()):
-        files = relabel(published_folder[0], tmp_path / str(number), changes)
+        files = copy_with_index_changes(published_folder[0], tmp_path / str(number), changes)
         with pytest.raises(PublishedFormatError, match=message):
             from_published(files, tmp_path / "out", kept_steps=KEPT)
 
 
 @pytest.mark.parametrize("link", [True, False])
-def test_verification_finds_a_history_twice(lite, tmp_path, link):
+def test_verification_finds_a_history_stored_twice(lite, tmp_path, link):
     to_published(load_icrl4aht(lite[0]), tmp_path / "files")
     with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
         del file["/1"]
@@ -153,12 +154,12 @@ def test_verification_finds_a_history_twice(lite, tmp_path, link):
     assert finding.problem == "history 1: has the content of history 0"
 
 
-def test_converting_again(lite, tmp_path):
+def test_conversion_overwrites_its_own_files_but_no_other_folders(lite, tmp_path):
     dataset, out = load_icrl4aht(lite[0]), tmp_path / "out"
     to_published(dataset, out)
     before = contents(out)
     assert before.keys() == {"histories.h5", "histories_index.jsonl", "tasks.jsonl", "provenance.json"}
-    (tmp_path / ".out.partial").mkdir()  # an interrupted conversion
+    (tmp_path / ".out.partial").mkdir()  # left by an interrupted conversion
     (tmp_path / ".out.partial" / "histories.h5").write_bytes(before["histories.h5"][:1000])
     to_published(dataset.filter(layout="demo_wide"), out, overwrite=True)
     assert contents(out)["histories_index.jsonl"] != before["histories_index.jsonl"]

@@ -1,4 +1,4 @@
-"""Writing releases: round trips with our reader and h5py; unfinished releases are never read."""
+"""Test writing releases: round trips with our reader, and no readable release after interrupted writing."""
 
 from __future__ import annotations
 
@@ -64,37 +64,37 @@ def test_any_release_round_trips_and_verifies(tmp_path, layout, episodes, length
 
 @settings(max_examples=50, deadline=None)
 @given(rows=st.integers(1, 40), extra=st.integers(0, 10), itemsize=st.integers(1, 24), seed=st.integers(0, 99))
-def test_chunks_decode_to_what_was_encoded(rows, extra, itemsize, seed):
+def test_decoded_chunks_equal_the_encoded_arrays(rows, extra, itemsize, seed):
     array = np.random.default_rng(seed).integers(0, 256, (rows, itemsize)).astype(np.uint8)
     raw = decode_chunk(encode_chunk(array, rows + extra, itemsize), (rows + extra) * itemsize, itemsize)
     assert raw == array.tobytes() + bytes(extra * itemsize)
 
 
-def test_two_writes_of_one_release_are_equal_bytes(tmp_path):
+def test_writing_a_release_twice_gives_equal_bytes(tmp_path):
     for name in ("a", "b"):
         random_release(tmp_path / name)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
     assert len(contents(tmp_path / "a")) >= 9
 
 
-def visible(folder):
-    """Return the names in a folder."""
+def names_in(folder):
+    """Return the sorted names of the entries of a folder."""
     return sorted(path.name for path in folder.iterdir())
 
 
-def write_cramped(root: Path, load: Callable[[], list[NewHistory]], streams: int = 1, **options: Any) -> None:
+def write_cramped_up(root: Path, load: Callable[[], list[NewHistory]], streams: int = 1, **options: Any) -> None:
     """Write a release of one task on cramped_up with episodes of 10 steps."""
     (task,) = make_tasks(["cramped_up"])
     new = NewTask(task, Provenance(), streams, load)
     write_release(root, "lite", [new], data_version="0.0.1", card="", kept_steps=10, **options)
 
 
-def played() -> dict[str, np.ndarray]:
+def random_arrays() -> dict[str, np.ndarray]:
     """Return the arrays of one history of 5 episodes of 10 steps on cramped_up."""
     return random_history(get_layout("cramped_up"), 5, 10, np.random.default_rng(0))
 
 
-def fail() -> list[NewHistory]:
+def raise_error() -> list[NewHistory]:
     raise RuntimeError("no data")
 
 
@@ -112,28 +112,31 @@ def fail() -> list[NewHistory]:
 )
 def test_invalid_histories_are_refused_without_leftovers(tmp_path, spoil, streams, message):
     with pytest.raises(OptionError, match=message):
-        write_cramped(
-            tmp_path / "out", lambda: [NewHistory(k, spoil(played())) for k in (0, 1)], streams, shard_histories=1
+        write_cramped_up(
+            tmp_path / "out",
+            lambda: [NewHistory(k, spoil(random_arrays())) for k in (0, 1)],
+            streams,
+            shard_histories=1,
         )
-    assert visible(tmp_path) == []
+    assert names_in(tmp_path) == []
 
 
-def test_a_failing_rewrite_leaves_the_old_release(tmp_path):
+def test_failed_overwrite_keeps_the_old_release(tmp_path):
     root = tmp_path / "release"
     random_release(root, seed=1)
     before = (root / "MANIFEST.sha256").read_bytes()
     with pytest.raises(OptionError, match="release: exists; give another folder, or replace it by --overwrite"):
-        write_cramped(root, fail)
+        write_cramped_up(root, raise_error)
     with pytest.raises(RuntimeError, match="no data"):
-        write_cramped(root, fail, overwrite=True)
+        write_cramped_up(root, raise_error, overwrite=True)
     assert (root / "MANIFEST.sha256").read_bytes() == before
     assert verify_release(root).ok
     random_release(root, seed=2, overwrite=True)
     assert (root / "MANIFEST.sha256").read_bytes() != before
-    assert visible(tmp_path) == ["release"], "no lock is left"
+    assert names_in(tmp_path) == ["release"], "no lock is left"
 
 
-def test_no_task_and_a_task_twice_are_refused(tmp_path):
+def test_write_release_refuses_no_tasks_and_duplicate_tasks(tmp_path):
     (task,) = make_tasks(["cramped_up"])
     new = NewTask(task, Provenance(), 1, list)
     for tasks in ([], [new, new]):
@@ -141,23 +144,23 @@ def test_no_task_and_a_task_twice_are_refused(tmp_path):
             write_release(tmp_path / "out", "lite", tasks, data_version="0.0.1", card="")
 
 
-def test_two_writers_of_one_release(tmp_path):
-    def meanwhile() -> list[NewHistory]:
+def test_second_writer_of_a_release_is_refused(tmp_path):
+    def load_during_write() -> list[NewHistory]:
         with pytest.raises(OptionError, match="another process is writing this folder"):
             random_release(tmp_path / "release")
-        return [NewHistory(0, played())]
+        return [NewHistory(0, random_arrays())]
 
-    write_cramped(tmp_path / "release", meanwhile)
+    write_cramped_up(tmp_path / "release", load_during_write)
     assert verify_release(tmp_path / "release").histories == 1
 
 
-def test_a_writer_killed_between_the_two_renames(tmp_path):
+def test_release_is_restored_after_a_kill_between_the_two_renames(tmp_path):
     random_release(tmp_path / "release", seed=1)
     before = (tmp_path / "release" / "MANIFEST.sha256").read_bytes()
     (tmp_path / "release").rename(tmp_path / ".release.old")
     (tmp_path / ".release.partial").mkdir()
     with pytest.raises(OptionError, match="release: exists"):
-        write_cramped(tmp_path / "release", fail)
+        write_cramped_up(tmp_path / "release", raise_error)
     assert (tmp_path / "release" / "MANIFEST.sha256").read_bytes() == before
 
 
@@ -166,7 +169,7 @@ def add_note(root: Path) -> None:
     (root / "note.txt").write_text("mine")
 
 
-def list_note(root: Path) -> None:
+def add_listed_note(root: Path) -> None:
     add_note(root)
     (root / "MANIFEST.sha256").write_text(f"{file_hash(root / 'note.txt')}  note.txt\n")
 
@@ -176,7 +179,7 @@ def list_note(root: Path) -> None:
     [
         (lambda root: root.write_text("mine"), "is not a folder"),
         (add_note, r"is not a release: it has no MANIFEST\.sha256; --overwrite replaces only"),
-        (list_note, "is not a release: .*'note.txt' is not a file that a release may contain"),
+        (add_listed_note, "is not a release: .*'note.txt' is not a file that a release may contain"),
         (
             lambda root: (add_note(root), (root / "MANIFEST.sha256").touch()),
             "is not a release: .* empty: expected a line",
@@ -188,27 +191,27 @@ def list_note(root: Path) -> None:
     ],
     ids=["file", "folder", "listed", "empty manifest", "release"],
 )
-def test_other_folders_are_not_replaced(tmp_path, make, message):
+def test_overwrite_refuses_folders_with_other_files(tmp_path, make, message):
     root = tmp_path / "release"
     make(root)
     before = contents(tmp_path)
     with pytest.raises(OptionError, match="exists; give another folder, or replace it by --overwrite"):
-        write_cramped(root, fail)
+        write_cramped_up(root, raise_error)
     with pytest.raises(OptionError, match=message):
-        write_cramped(root, fail, overwrite=True)
+        write_cramped_up(root, raise_error, overwrite=True)
     assert contents(tmp_path) == before
 
 
 def test_folders_created_during_writing_are_not_replaced(tmp_path):
     root = tmp_path / "release"
 
-    def meanwhile() -> list[NewHistory]:
+    def load_during_write() -> list[NewHistory]:
         add_note(root)
-        return [NewHistory(0, played())]
+        return [NewHistory(0, random_arrays())]
 
     for overwrite, message in ((False, "exists"), (True, r"contains note\.txt")):
         with pytest.raises(OptionError, match=message):
-            write_cramped(root, meanwhile, overwrite=overwrite)
+            write_cramped_up(root, load_during_write, overwrite=overwrite)
         assert (root / "note.txt").read_text() == "mine"
         shutil.rmtree(root)
         random_release(root, seed=1)
@@ -252,4 +255,4 @@ random_release(Path(sys.argv[1]), streams={streams}, episodes=60, length=100)
     assert not verify_release(tmp_path / ".release.partial").ok
     random_release(root, streams=1)  # the next writer removes the leftovers
     assert verify_release(root).ok
-    assert visible(tmp_path) == ["release"]
+    assert names_in(tmp_path) == ["release"]

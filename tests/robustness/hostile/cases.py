@@ -1,6 +1,6 @@
-"""Hostile releases, folders of published files and servers, by what some message about them says.
+"""Hostile releases, published files and servers, each with the message that must report the fault.
 
-The hashes of a hostile release are right unless the case is about the manifest or its file cannot be hashed.
+A hostile release has matching hashes, unless the case concerns the manifest or a file that cannot be hashed.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ ChangeFile = Callable[[Any, Path], object]
 """Called with an open HDF5 file or group and the folder `outside`."""
 
 
-def outside(root: Path) -> Path:
+def outside_folder(root: Path) -> Path:
     """Return the folder that no release may touch."""
     return root.parent / "outside"
 
 
-def teammate(root: Path) -> str:
-    """Return the path of the weights of the release's learned teammate."""
+def policy_path(root: Path) -> str:
+    """Return the path of the learned teammate's weights, relative to the release."""
     return next((root / "teammates").glob("*/policy.safetensors")).relative_to(root).as_posix()
 
 
-def listed(name: str) -> Spoil:
+def add_line(name: str) -> Spoil:
     """Add a line to the manifest."""
 
     def spoil(root: Path) -> None:
@@ -69,35 +69,35 @@ def replaced(name: str | Callable[[Path], str], make: Make) -> Spoil:
     return spoil
 
 
-def link_out(path: Path, root: Path) -> None:
-    path.symlink_to(outside(root) / "secret.txt")
+def secret_link(path: Path, root: Path) -> None:
+    path.symlink_to(outside_folder(root) / "secret.txt")
 
 
-def folder_link_out(path: Path, root: Path) -> None:
-    path.symlink_to(outside(root))
+def folder_link(path: Path, root: Path) -> None:
+    path.symlink_to(outside_folder(root))
 
 
-def pipe(path: Path, root: Path) -> None:
+def named_pipe(path: Path, root: Path) -> None:
     os.mkfifo(path)
 
 
-def sparse(path: Path, root: Path) -> None:
+def terabyte(path: Path, root: Path) -> None:
     """Create a file of a terabyte that takes no disk space."""
     with path.open("wb") as stream:
         stream.truncate(TERABYTE)
 
 
-def content(text: str | bytes) -> Make:
+def file_with(text: str | bytes) -> Make:
     """Create a file with this content."""
     return lambda path, root: path.write_bytes(text if isinstance(text, bytes) else text.encode())
 
 
 def deep(levels: int) -> Make:
     """Create a file of nested JSON objects."""
-    return content('{"a":' * levels + "1" + "}" * levels)
+    return file_with('{"a":' * levels + "1" + "}" * levels)
 
 
-def json_file(name: str, change: Callable[[Any], Any]) -> Spoil:
+def change_json(name: str, change: Callable[[Any], Any]) -> Spoil:
     """Change the parsed content of a JSON file in place, or replace it by the result of `change`."""
 
     def spoil(root: Path) -> None:
@@ -108,7 +108,7 @@ def json_file(name: str, change: Callable[[Any], Any]) -> Spoil:
     return spoil
 
 
-def lines(change: Callable[[list[dict[str, Any]]], list | None], name: str = HISTORIES) -> Spoil:
+def change_lines(change: Callable[[list[dict[str, Any]]], list | None], name: str = HISTORIES) -> Spoil:
     """Change the parsed lines of a file of JSON lines in place, or replace them by the result of `change`."""
 
     def spoil(root: Path) -> None:
@@ -122,16 +122,16 @@ def lines(change: Callable[[list[dict[str, Any]]], list | None], name: str = HIS
 
 def entry(name: str = HISTORIES, /, **changes: Any) -> Spoil:
     """Change fields of the first line of the index."""
-    return lines(lambda values: values[0].update(changes), name)
+    return change_lines(lambda values: values[0].update(changes), name)
 
 
-def info(**changes: Any) -> Spoil:
+def change_info(**changes: Any) -> Spoil:
     """Change fields of info.json."""
-    return json_file(INFO, lambda value: value.update(changes))
+    return change_json(INFO, lambda value: value.update(changes))
 
 
 def theta(**changes: Any) -> Spoil:
-    """Change theta of the learned teammate, and its task's id to one that fits."""
+    """Change theta of the learned teammate, and update the id of the teammate's task."""
 
     def spoil(root: Path) -> None:
         tasks = [Task(**json.loads(line)) for line in (root / TASKS).read_text().splitlines()]
@@ -158,23 +158,23 @@ def table(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
     return spoil
 
 
-def npy(header: str, version: bytes = b"\x01\x00", length: int | None = None) -> Make:
+def npy_header(header: str, version: bytes = b"\x01\x00", length: int | None = None) -> Make:
     """Create a .npy file that ends after its header."""
     size = len(header) if length is None else length
-    return content(b"\x93NUMPY" + version + size.to_bytes(2 if version[0] == 1 else 4, "little") + header.encode())
+    return file_with(b"\x93NUMPY" + version + size.to_bytes(2 if version[0] == 1 else 4, "little") + header.encode())
 
 
 def hdf5(change: ChangeFile, name: str = SHARD) -> Spoil:
-    """Change an HDF5 file, not its chunk table."""
+    """Change an HDF5 file, but not its chunk table."""
 
     def spoil(root: Path) -> None:
         with h5py.File(root / name, "r+") as file:
-            change(file, outside(root))
+            change(file, outside_folder(root))
 
     return spoil
 
 
-def actions(make: ChangeFile) -> ChangeFile:
+def set_actions(make: ChangeFile) -> ChangeFile:
     """Replace the actions of the first group by what `make` creates in the group."""
 
     def change(file: Any, out: Path) -> None:
@@ -184,28 +184,28 @@ def actions(make: ChangeFile) -> ChangeFile:
     return change
 
 
-def dataset(shape: tuple[int, ...] = (4, 120), dtype: Any = "i1", **options: Any) -> ChangeFile:
+def new_dataset(shape: tuple[int, ...] = (4, 120), dtype: Any = "i1", **options: Any) -> ChangeFile:
     """Replace the actions by a dataset with these properties."""
-    return actions(lambda group, out: group.create_dataset("actions", shape, dtype, **options))
+    return set_actions(lambda group, out: group.create_dataset("actions", shape, dtype, **options))
 
 
-def typed(dtype: Any) -> ChangeFile:
+def typed_actions(dtype: Any) -> ChangeFile:
     """Replace the actions by values of another type."""
-    return dataset(dtype=dtype, chunks=(1, 120), compression="gzip")
+    return new_dataset(dtype=dtype, chunks=(1, 120), compression="gzip")
 
 
 def link(target: Callable[[Path], Any]) -> ChangeFile:
     """Replace the actions by a link."""
-    return actions(lambda group, out: group.__setitem__("actions", target(out)))
+    return set_actions(lambda group, out: group.__setitem__("actions", target(out)))
 
 
 class Case(NamedTuple):
-    """A hostile input.
+    """Hostile input and the message that must report the fault.
 
     Attributes:
-        kind: "release", "published" or "served".
-        message: a regular expression that some message about it matches.
-        spoil: changes a valid release or folder of published files.
+        kind: "release", "published" (files of the published code) or "served" (by a faulty server).
+        message: a regular expression that some error or finding must match.
+        spoil: function that damages a valid release or folder of published files.
         rules: faults of the server by path pattern, for a served release.
     """
 
@@ -219,18 +219,18 @@ CASES: dict[str, Case] = {}
 
 
 def add(kind: str, message: str, spoils: Mapping[str, Spoil]) -> None:
-    """Add cases of one kind that have one message."""
+    """Add cases of one kind with the same message."""
     for name, spoil in spoils.items():
         add_case(f"{kind}: {name}", Case(kind, message, spoil))
 
 
 def add_hashed(message: str, spoils: Mapping[str, Spoil]) -> None:
-    """Add releases with matching manifests, since an attacker can write the manifest, too."""
+    """Add releases with matching manifests, because an attacker can also write the manifest."""
 
-    def hashed(spoil: Spoil) -> Spoil:
+    def with_manifest(spoil: Spoil) -> Spoil:
         return lambda root: (spoil(root), write_manifest(root))
 
-    add("release", message, {name: hashed(spoil) for name, spoil in spoils.items()})
+    add("release", message, {name: with_manifest(spoil) for name, spoil in spoils.items()})
 
 
 def add_case(name: str, case: Case) -> None:
@@ -238,7 +238,7 @@ def add_case(name: str, case: Case) -> None:
     CASES[name] = case
 
 
-# Paths
+# Cases of paths that lead out of the release
 
 _NAMES = {
     "up": "../outside/new",
@@ -248,18 +248,20 @@ _NAMES = {
     "control": "meta/\x1b[2J",
     "long": "x" * 300,
 }
-add("release", "leads out of the release", {f"manifest: {name}": listed(path) for name, path in _NAMES.items()})
-add("release", "are the same file on some", {"manifest: upper case": listed(SHARD.replace("teammate", "TEAMMATE"))})
-add("release", "not a file that a release may contain", {"manifest: code": listed("sitecustomize.py")})
+add("release", "leads out of the release", {f"manifest: {name}": add_line(path) for name, path in _NAMES.items()})
+add(
+    "release", "are the same file on some", {"manifest: upper case": add_line(SHARD.replace("teammate", "TEAMMATE"))}
+)
+add("release", "not a file that a release may contain", {"manifest: code": add_line("sitecustomize.py")})
 _many = "".join(f"data/d/d/{number}.h5\n{number:064}  " for number in range(50_000)) + "data/d/d/last.h5"
-add("release", "listed in the manifest, but missing", {"manifest: many lines": listed(_many)})
+add("release", "listed in the manifest, but missing", {"manifest: many lines": add_line(_many)})
 
-for _file in (INFO, SHARD, teammate):
+for _file in (INFO, SHARD, policy_path):
     _label = _file if isinstance(_file, str) else "teammate"
-    add("release", "leads out of the release", {f"link out: {_label}": replaced(_file, link_out)})
-    add("release", "neither a file nor a folder", {f"pipe: {_label}": replaced(_file, pipe)})
+    add("release", "leads out of the release", {f"link out: {_label}": replaced(_file, secret_link)})
+    add("release", "neither a file nor a folder", {f"pipe: {_label}": replaced(_file, named_pipe)})
     _too_large = r"expected at most|more than|truncated|twice|chunk table"
-    add("release", _too_large, {f"a terabyte: {_label}": replaced(_file, sparse)})
+    add("release", _too_large, {f"a terabyte: {_label}": replaced(_file, terabyte)})
 
 
 def deep_folder(root: Path) -> None:
@@ -278,17 +280,17 @@ _folders = ("data", "meta")
 add(
     "release",
     "leads out of the release",
-    {f"folder linked out: {name}": replaced(name, folder_link_out) for name in _folders},
+    {f"folder linked out: {name}": replaced(name, folder_link) for name in _folders},
 )
-add("release", "extra: not listed", {"unlisted pipe": replaced("extra", pipe)})
+add("release", "extra: not listed", {"unlisted pipe": replaced("extra", named_pipe)})
 add("release", "not listed in the manifest", {"folders too deep": deep_folder})
 
 
-def _terminal_codes(root: Path) -> None:
+def _add_name_with_terminal_codes(root: Path) -> None:
     Path(os.fsdecode(os.fsencode(root) + b"/\x1b]0;owned\x07\xff")).touch()
 
 
-add("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes": _terminal_codes})
+add("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes": _add_name_with_terminal_codes})
 
 add_hashed("matching regex", {"checkpoint's hash": theta(sha256="../../outside")})
 _paths = {"above": "../../outside", "absolute": "/etc", "backslash": "..\\..\\outside", "surrogate": "\ud800"}
@@ -296,43 +298,43 @@ add_hashed(
     "expected a path within", {f"checkpoint's path: {name}": theta(checkpoint=path) for name, path in _paths.items()}
 )
 
-# Numbers, sizes and text
+# Cases of extreme numbers, sizes and texts
 
 _integers = {"T": 2**62, "seed": 10**4000}
 add_hashed("Expected `int` <=", {f"index: large {name}": entry(**{name: value}) for name, value in _integers.items()})
 add_hashed("the index implies", {"rows: 2**39": entry(T=2**39)})
-add_hashed("histories", {"info: histories 2**62": info(histories=2**62)})
-_size = json_file(INFO, lambda value: value["shards"].update({SHARD: 2**61}))
+add_hashed("histories", {"info: histories 2**62": change_info(histories=2**62)})
+_size = change_json(INFO, lambda value: value["shards"].update({SHARD: 2**61}))
 add_hashed(r"expected 2,305,843,009,213,693,952 bytes, found \d", {"info: shard of 2**61 bytes": _size})
-add_hashed("shards: expected", {"info: no shards": info(shards={})})
-_digits = content('{"format_version": ' + "9" * 10**6 + "}")
+add_hashed("shards: expected", {"info: no shards": change_info(shards={})})
+_digits = file_with('{"format_version": ' + "9" * 10**6 + "}")
 add_hashed("malformed", {"info: too deep": replaced(INFO, deep(100_000)), "info: many digits": replaced(INFO, _digits)})
-add_hashed("SemVer", {"info: version with terminal codes": info(data_version="\x1b[2J")})
+add_hashed("SemVer", {"info: version with terminal codes": change_info(data_version="\x1b[2J")})
 
 
-def nested(levels: int) -> list:
-    """Return lists in lists."""
+def nested_lists(levels: int) -> list:
+    """Return lists nested `levels` deep."""
     value: list = []
     for _ in range(levels):
         value = [value]
     return value
 
 
-_deep_theta = lines(lambda values: values[0]["teammate"]["theta"].update(x=nested(400)), TASKS)
+_deep_theta = change_lines(lambda values: values[0]["teammate"]["theta"].update(x=nested_lists(400)), TASKS)
 _deep_files = {f"deep: {name}": replaced(name, deep(500)) for name in (INFO, PROVENANCE)}
 add_hashed("levels deep", _deep_files | {"tasks: deep theta": _deep_theta})
-_endless_line = content(b"a" * 2**24)
+_endless_line = file_with(b"a" * 2**24)
 for _of, _file in {"index": HISTORIES, "tasks": TASKS}.items():
     add_hashed("expected at most", {f"{_of}: one endless line": replaced(_file, _endless_line)})
 add_hashed("line 1: ", {"index: a surrogate": entry(task_id="\ud800")})
 add_hashed("line 1: JSON is malformed", {"index: not a number": entry(score=float("nan"))})
 add_hashed("Expected `float` <", {"index: infinite": entry(return_end=1e308)})
 
-# Chunk tables and chunks
+# Cases of damaged chunk tables and chunks
 
 
 class Bomb:
-    """Object that creates a folder when it is unpickled."""
+    """Object that creates a folder when unpickled."""
 
     def __init__(self, target: Path) -> None:
         self.target = target
@@ -341,25 +343,25 @@ class Bomb:
         return os.mkdir, (str(self.target),)
 
 
-def pickled(path: Path, root: Path) -> None:
-    np.save(path, np.array([Bomb(outside(root) / "executed")], object), allow_pickle=True)
+def pickled_table(path: Path, root: Path) -> None:
+    np.save(path, np.array([Bomb(outside_folder(root) / "executed")], object), allow_pickle=True)
 
 
-def archive(path: Path, root: Path) -> None:
+def archived_table(path: Path, root: Path) -> None:
     np.savez(path.with_suffix(".npz"), np.zeros(4, CHUNK_DTYPE))
     path.with_suffix(".npz").rename(path)
 
 
 def gigabyte_of_zeros() -> bytes:
-    """Return a gigabyte of zeros, deflated: parts of 16 MiB, of which all but the first are the same bytes."""
+    """Return a deflated gigabyte of zeros in parts of 16 MiB; all parts but the first have equal bytes."""
     compressor = zlib.compressobj(9)
     first, part = (compressor.compress(bytes(2**24)) + compressor.flush(zlib.Z_FULL_FLUSH) for _ in range(2))
-    checksum = (2**30 % 65521) << 16 | 1  # Adler-32
+    checksum = (2**30 % 65521) << 16 | 1  # Adler-32 checksum of a gigabyte of zeros
     return first + 63 * part + compressor.flush()[:-4] + checksum.to_bytes(4, "big")
 
 
-def inflating(root: Path) -> None:
-    """Replace the first chunk by one that inflates to a gigabyte."""
+def inflating_chunk(root: Path) -> None:
+    """Replace the first chunk by a chunk that inflates to a gigabyte."""
     data, path, rows = gigabyte_of_zeros(), root / SHARD, np.load(root / TABLE)
     rows["offset"][0], rows["size"][0] = path.stat().st_size, len(data)
     rows["crc32"][0], rows["hash"][0] = zlib.crc32(data), np.frombuffer(chunk_hash(data), np.uint8)
@@ -371,20 +373,20 @@ def inflating(root: Path) -> None:
 _HEADER = "{{'descr': {}, 'fortran_order': False, 'shape': {}, }}"
 _ROWS = str(CHUNK_DTYPE.descr)
 _TABLES = {
-    "2**50 rows": npy(_HEADER.format(_ROWS, f"({2**50},)")),
-    "long header": npy("{", b"\x03\x00", 2**32 - 1),
-    "objects": npy(_HEADER.format("[('offset', '|O'), ('size', '<u4')]", "(4,)")),
-    "calls": npy(_HEADER.format("__import__('os').system('true')", "(4,)")),
-    "pickle": pickled,
-    "archive": archive,
+    "2**50 rows": npy_header(_HEADER.format(_ROWS, f"({2**50},)")),
+    "long header": npy_header("{", b"\x03\x00", 2**32 - 1),
+    "objects": npy_header(_HEADER.format("[('offset', '|O'), ('size', '<u4')]", "(4,)")),
+    "calls": npy_header(_HEADER.format("__import__('os').system('true')", "(4,)")),
+    "pickle": pickled_table,
+    "archive": archived_table,
 }
 add_hashed("chunk table|expected rows of", {f"table: {name}": replaced(TABLE, make) for name, make in _TABLES.items()})
 add_hashed("covers more than", {"table: huge chunks": table(lambda rows: rows["size"].__setitem__(0, 2**32 - 1))})
 add_hashed("cover|crc32", {"table: one offset": table(lambda rows: rows["offset"].__setitem__(slice(None), 0))})
 add_hashed("cannot be", {"table: no bytes": table(lambda rows: rows["size"].__setitem__(0, 0))})
-add_hashed("cannot be|twice", {"chunk that inflates to a gigabyte": inflating})
+add_hashed("cannot be|twice", {"chunk that inflates to a gigabyte": inflating_chunk})
 
-# Structures that libhdf5 would follow, load or believe
+# Cases of HDF5 structures that libhdf5 would follow, load or trust
 
 
 def virtual(group: Any, out: Path) -> None:
@@ -397,7 +399,7 @@ def external(group: Any, out: Path) -> None:
     group.create_dataset("actions", (480,), "i1", external=[(str(out / "secret.txt"), 0, 480)])
 
 
-def filtered(group: Any, out: Path) -> None:
+def filtered_data(group: Any, out: Path) -> None:
     """Create a dataset whose filter libhdf5 would load from a plugin."""
     low: Any = h5py
     properties = low.h5p.create(low.h5p.DATASET_CREATE)
@@ -407,11 +409,11 @@ def filtered(group: Any, out: Path) -> None:
     low.h5d.create(group.id, b"actions", low.h5t.NATIVE_INT8, space, properties)
 
 
-def another_name(file: Any, out: Path) -> None:
+def extra_name(file: Any, out: Path) -> None:
     file["0"]["more"] = h5py.ExternalLink(str(out / "secret.h5"), "/secret")
 
 
-def group_link_out(file: Any, out: Path) -> None:
+def link_group_out(file: Any, out: Path) -> None:
     file.move("0", "kept")
     file["0"] = h5py.ExternalLink(str(out / "secret.h5"), "/")
 
@@ -422,21 +424,21 @@ _SHARED: dict[str, dict[str, ChangeFile]] = {
         "link to a file": link(lambda out: h5py.ExternalLink(str(out / "secret.h5"), "/secret")),
         "link to a pipe": link(lambda out: h5py.ExternalLink(str(out / "pipe"), "/secret")),
     },
-    "in other files|local heap": {"external storage": actions(external), "virtual": actions(virtual)},
-    r"filters \[32004\]|found \(\[32004\]": {"a plugin's filter": actions(filtered)},
+    "in other files|local heap": {"external storage": set_actions(external), "virtual": set_actions(virtual)},
+    r"filters \[32004\]|found \(\[32004\]": {"a plugin's filter": set_actions(filtered_data)},
     "expected numbers": {
-        "texts": typed(h5py.string_dtype()),
-        "references": typed(h5py.ref_dtype),
-        "records": typed([("a", "i4"), ("b", "i4")]),
+        "texts": typed_actions(h5py.string_dtype()),
+        "references": typed_actions(h5py.ref_dtype),
+        "records": typed_actions([("a", "i4"), ("b", "i4")]),
     },
-    "groups: expected|lead out of the file": {"group linked out": group_link_out},
+    "groups: expected|lead out of the file": {"group linked out": link_group_out},
 }
 """Message -> changes of the first group, of shards and of published files."""
 _OF_SHARDS: dict[str, dict[str, ChangeFile]] = {
-    "expected": {"endless rows": dataset((2**50,), chunks=(120,), compression="gzip")},
-    "chunks": {"huge chunks": dataset(chunks=(1, 2**30), maxshape=(4, None), compression="gzip")},
-    "not a dataset|expected": {"circle of groups": actions(lambda group, out: group.__setitem__("actions", group))},
-    r"expected \[.*found \[.*'more'": {"one name more": another_name},
+    "expected": {"endless rows": new_dataset((2**50,), chunks=(120,), compression="gzip")},
+    "chunks": {"huge chunks": new_dataset(chunks=(1, 2**30), maxshape=(4, None), compression="gzip")},
+    "not a dataset|expected": {"circle of groups": set_actions(lambda group, out: group.__setitem__("actions", group))},
+    r"expected \[.*found \[.*'more'": {"one name more": extra_name},
     "attribute": {
         "attribute of texts": lambda file, out: file.attrs.create("layout", ["x"] * 9),
     },
@@ -444,11 +446,11 @@ _OF_SHARDS: dict[str, dict[str, ChangeFile]] = {
 for _message, _changes in (_SHARED | _OF_SHARDS).items():
     add_hashed(_message, {f"shard: {name}": hdf5(change) for name, change in _changes.items()})
 
-# Published files
+# Cases of published files
 
 
 def endless_history(root: Path) -> None:
-    """Let all datasets of the first published history have 2**39 rows, as its line states."""
+    """Give all datasets of the first published history 2**39 rows, as its index line then states."""
     entry("histories_index.jsonl", T=2**39)(root)
     with h5py.File(root / "histories.h5", "r+") as file:
         group: Any = file["0"]
@@ -458,8 +460,8 @@ def endless_history(root: Path) -> None:
             group.create_dataset(name, (2**39, *rest), dtype, chunks=(100, *rest), compression="gzip")
 
 
-def inflating_published(file: Any, out: Path) -> None:
-    """Replace the first chunks of the first published history by ones that inflate to a gigabyte."""
+def inflating_published_chunks(file: Any, out: Path) -> None:
+    """Replace the first chunks of the first published history by chunks that inflate to a gigabyte."""
     data = gigabyte_of_zeros()
     for name in ("dones", "actions", "obs", "state"):
         stored = file["0"][name].id
@@ -471,23 +473,23 @@ for _message, _changes in _SHARED.items():
     _spoils = {name: hdf5(change, _H5) for name, change in _changes.items()}
     add("published", f"group /0.*({_message})|cannot be read: .*{_message}", _spoils)
 _PUBLISHED = (_H5, _INDEX)
-for _message, _make in {"leads out": link_out, "neither a file": pipe, "at most|HDF5": sparse}.items():
+for _message, _make in {"leads out": secret_link, "neither a file": named_pipe, "at most|HDF5": terabyte}.items():
     add("published", _message, {f"{_make.__name__}: {name}": replaced(name, _make) for name in _PUBLISHED})
-_endless = hdf5(dataset((2**39,), "i4", chunks=(4096,), compression="gzip"), _H5)
+_endless = hdf5(new_dataset((2**39,), "i4", chunks=(4096,), compression="gzip"), _H5)
 add("published", "expected numbers of shape", {"endless rows": _endless})
 add("published", "cannot contain the declared|memory", {"endless history": endless_history})
-add("published", "contradicts the|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published, _H5)})
+add("published", "contradicts the|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published_chunks, _H5)})
 add("published", "Expected `int` >= 1", {"rows below zero": entry(_INDEX, T=-5)})
 add("published", "missing", {"group above": entry(_INDEX, h5_group="../0")})
 add("published", "lite", {"circle of groups": hdf5(lambda file, out: file["0"].__setitem__("a", file["0"]), _H5)})
 add("published", "printable", {"task id of surrogates": entry(_INDEX, task_id="\ud800")})
 add("published", "expected at most", {"one endless line": replaced(_INDEX, _endless_line)})
 
-# Servers
+# Cases of faulty servers
 
-add("served", "expected at most", {f"a terabyte: {name}": replaced(name, sparse) for name in (MANIFEST, TABLE)})
-add("served", "expected at most|sha256", {"a terabyte: shard": replaced(SHARD, sparse)})
-add("served", "leads out of the release", {"names above": listed("../../new")})
+add("served", "expected at most", {f"a terabyte: {name}": replaced(name, terabyte) for name in (MANIFEST, TABLE)})
+add("served", "expected at most|sha256", {"a terabyte: shard": replaced(SHARD, terabyte)})
+add("served", "leads out of the release", {"names above": add_line("../../new")})
 for _name, _message, _rules in (
     ("endless manifest", "MANIFEST", {"*/MANIFEST.sha256": Long(TERABYTE)}),
     ("endless index", "expected at most|more came|says", {f"*/{HISTORIES}": Long(TERABYTE)}),

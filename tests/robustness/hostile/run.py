@@ -1,4 +1,4 @@
-"""Reads hostile inputs in a process of its own, whose memory is bounded."""
+"""Read hostile inputs in a separate process with bounded memory."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Steps = dict[str, Callable[[], Any]]
 
 
 def make_release(root: Path) -> None:
-    """Write two histories with a heuristic and two with a learned teammate."""
+    """Write a release of two histories with a heuristic teammate and two with a learned teammate."""
     files = {"policy.safetensors": b"weights", "policy.json": b"{}"}
     for name, data in files.items():
         (root.parent / name).write_bytes(data)
@@ -71,7 +71,7 @@ def make_outside(folder: Path) -> None:
 
 
 def file_states(folder: Path) -> dict[str, tuple]:
-    """Return mode, size, time and inode of all files below a folder, without opening any."""
+    """Return mode, size, time and inode of all files below a folder, without opening the files."""
     states = {}
     for name in files_below(folder):
         try:
@@ -82,8 +82,8 @@ def file_states(folder: Path) -> dict[str, tuple]:
     return states
 
 
-def outcome(step: Callable[[], Any]) -> dict[str, Any]:
-    """Return whether a step ended well or in one of our errors, its text, and its seconds."""
+def run_step(step: Callable[[], Any]) -> dict[str, Any]:
+    """Run a step; return whether the step succeeded or raised a package error, and its text."""
     try:
         with time_limit(SECONDS):
             ours, text = True, str(step() or "")
@@ -94,7 +94,7 @@ def outcome(step: Callable[[], Any]) -> dict[str, Any]:
     return {"ours": ours, "said": text}
 
 
-def read(root: Path) -> None:
+def read_all_fields(root: Path) -> None:
     """Read every field of every history."""
     dataset = load_icrl4aht(root, threads=1)
     for history in dataset:
@@ -105,7 +105,7 @@ def read(root: Path) -> None:
         dataset.recover_teammate(history.entry.history_id)
 
 
-def sample(root: Path) -> None:
+def sample_batches(root: Path) -> None:
     """Sample a batch of each kind from memory and from a stream."""
     for cache in ("ram", "stream"):
         dataset = load_icrl4aht(root, cache=cache, threads=1)
@@ -113,14 +113,14 @@ def sample(root: Path) -> None:
         dataset.dpt(batch_size=4, context=8)[0]
 
 
-def findings(root: Path) -> str:
-    """Return what `verify` finds, which must be something."""
+def verify_findings(root: Path) -> str:
+    """Return the problems that `verify` finds; at least one problem is expected."""
     report = verify_release(root, level="deep")
     assert not report.ok, "verify finds nothing"
     return "\n".join(f"{finding.file}: {finding.problem}" for finding in report.findings[:1000])
 
 
-def download(root: Path, out: Path, case: Case) -> None:
+def download_release(root: Path, out: Path, case: Case) -> None:
     """Download from a server with the faults of a case."""
     faults = Faults()
     for path, fault in case.rules.items():
@@ -130,18 +130,18 @@ def download(root: Path, out: Path, case: Case) -> None:
 
 
 def steps_of(case: Case, root: Path, out: Path) -> Steps:
-    """Return what is done with a hostile input."""
+    """Return the operations to run on a hostile input, by name."""
     if case.kind == "served":
-        return {"download": lambda: download(root, out, case)}
+        return {"download": lambda: download_release(root, out, case)}
     if case.kind == "published":
         return {
             "lite": lambda: from_published(root, out / "lite", kept_steps=20),
             "observations": lambda: from_published(root, out / "observations", "observations", kept_steps=20),
         }
     return {
-        "read": lambda: read(root),
-        "sample": lambda: sample(root),
-        "verify": lambda: findings(root),
+        "read": lambda: read_all_fields(root),
+        "sample": lambda: sample_batches(root),
+        "verify": lambda: verify_findings(root),
         "quick": lambda: verify_release(root, level="quick"),
         "convert": lambda: to_release(load_icrl4aht(root), out / "full", "full"),
         "published": lambda: to_published(load_icrl4aht(root), out / "published"),
@@ -149,8 +149,8 @@ def steps_of(case: Case, root: Path, out: Path) -> Steps:
     }
 
 
-def run(folder: Path, base: Path, case: Case) -> dict[str, Any]:
-    """Return the outcome of each step of a case, and what it left behind."""
+def run_in_folder(folder: Path, base: Path, case: Case) -> dict[str, Any]:
+    """Run all steps of a case; return outcomes, changes of files, leaked secrets and written bytes."""
     folder.mkdir()
     root, out = folder / "root", folder / "out"
     shutil.copytree(base, root)
@@ -159,34 +159,34 @@ def run(folder: Path, base: Path, case: Case) -> dict[str, Any]:
     case.spoil(root)
     before = file_states(root), file_states(folder / "outside"), sorted(folder.iterdir())
     os.chdir(out)
-    outcomes = {name: outcome(step) for name, step in steps_of(case, root, out).items()}
+    outcomes = {name: run_step(step) for name, step in steps_of(case, root, out).items()}
     touched = before != (file_states(root), file_states(folder / "outside"), sorted(folder.iterdir()))
     written = [out / name for name in files_below(out)]
-    leaked = [str(path) for path in written if path.is_symlink() or not path.is_file() or _reveals(path)]
+    leaked = [str(path) for path in written if path.is_symlink() or not path.is_file() or _contains_secret(path)]
     taken = sum(path.lstat().st_blocks * 512 for path in written)
     leaked += [step for step, outcome in outcomes.items() if SECRET in outcome["said"]]
     os.chdir(folder.parent)
-    subprocess.run(["rm", "-rf", str(folder)], check=True)  # shutil.rmtree recurses, which deep folders exhaust
+    subprocess.run(["rm", "-rf", str(folder)], check=True)  # shutil.rmtree fails on folders that are nested too deep
     return {"steps": outcomes, "touched": touched, "leaked": leaked, "taken": taken}
 
 
-def _reveals(path: Path) -> bool:
+def _contains_secret(path: Path) -> bool:
     return path.stat().st_size < LARGE and SECRET.encode() in path.read_bytes()
 
 
 def make_bases(folder: Path) -> None:
-    """Write the valid release and the valid published files that cases spoil."""
+    """Write the valid release and the valid published files that cases damage."""
     make_release(folder / "release")
     to_published(load_icrl4aht(folder / "release"), folder / "published")
 
 
 def bound_process() -> None:
-    """Bound the memory of this process for good, and let warnings be errors."""
+    """Limit the memory of this process permanently, and turn warnings into errors."""
     warnings.simplefilter("error")
     _BOUND.enter_context(memory_limit(MEMORY))
 
 
 def run_case(folder: Path, name: str) -> dict[str, Any]:
-    """Run the case of this name below a folder with the bases."""
+    """Run the case of this name in a folder that `make_bases` has filled."""
     base = folder / ("published" if CASES[name].kind == "published" else "release")
-    return run(folder / "case", base, CASES[name])
+    return run_in_folder(folder / "case", base, CASES[name])
