@@ -30,7 +30,7 @@ def population(algorithm: Algorithm, config: PPOConfig = CONFIG, **options: Any)
     return Population(Environment(LAYOUT, max_steps=EPISODE), algorithm, config, **options)
 
 
-def reference_adapt(old: Multipliers, returns: np.ndarray, seen: np.ndarray, tolerance: float, rate: float) -> Multipliers:
+def paper_adapt(old: Multipliers, returns: np.ndarray, seen: np.ndarray, tolerance: float, rate: float) -> Multipliers:
     """Return the multipliers by the LBRDiv paper, entry by entry; [i, j]: confederate i with best response j."""
     k = len(old.vertical)
     vertical, horizontal, latest = (np.array(x, np.float64) for x in old[:3])
