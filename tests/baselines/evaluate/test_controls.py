@@ -54,7 +54,7 @@ def _act(mode, memory, ego_input, key):
 
 
 def ego(mode):
-    """Return an ego that stays, acts randomly, or (PAID) stays, then acts randomly if the first episode had no reward."""
+    """Return an ego that stays, acts randomly, or (PAID) acts randomly only after a first episode without reward."""
     policy = Policy(jnp.int32(mode), _begin, _act, "ego_input")
     return lambda layout: policy
 

@@ -116,7 +116,7 @@ def test_tiny_best_response_and_headroom_jobs_finish(tmp_path):
     modes = job.result()["modes"]
     assert all(np.isfinite(list(found.values())).all() for found in modes.values())
     before = (tmp_path / job.name / "result.json").read_bytes()
-    job.run(lambda updates, speed: pytest.fail("a write_finished_job job was trained again"))
+    job.run(lambda updates, speed: pytest.fail("a finished job was trained again"))
     assert (tmp_path / job.name / "result.json").read_bytes() == before
     tasks = {"all": [DEMO[5], *tasks_of("teammate", "test_wide", "H1")[:1]]}
     for other in headroom_jobs(tasks, 1, TINY, tmp_path):

@@ -73,7 +73,7 @@ def trained(folder: Path, die_at: int | None = None, changes: Any = None, **opti
 @pytest.fixture(scope="module")
 def full_run(tmp_path_factory) -> tuple[Path, TrainState]:
     """Return the folder and the final state of a training without interruption."""
-    folder = tmp_path_factory.mktemp("runs") / "full_run"
+    folder = tmp_path_factory.mktemp("runs") / "through"
     return folder, trained(folder)
 
 
