@@ -100,7 +100,7 @@ def test_batch_that_does_not_fit_in_memory_is_split(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("encoder", ["paper", "words", "mlp"])
 def test_updates_of_ego_learners_can_be_lowered_for_cuda(encoder):
-    """In the sizes that the benchmark has on a GPU; nothing is compiled."""
+    """Programs with the sizes that the benchmark uses on a GPU are lowered, but not compiled."""
     learner = ego_learner(FULL_SIZES, encoder)
     update: Any = compiled_update(learner)
     traced = update.trace(jax.eval_shape(learner.init, jax.random.key(0)))
@@ -111,7 +111,7 @@ def test_updates_of_ego_learners_can_be_lowered_for_cuda(encoder):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["small/paper/bfloat16", "small/words/float32", "tiny/mlp/bfloat16"])
 def test_training_steps_of_models_can_be_lowered_for_cuda(case):
-    """In the sizes that the benchmark has on a GPU; nothing is compiled."""
+    """Programs with the sizes that the benchmark uses on a GPU are lowered, but not compiled."""
     size, encoder, dtype = case.split("/")
     dataset, length = load_icrl4aht(layout="demo_wide", obs="state"), context_length(FULL_SIZES, size)
     method = ad_method(architecture(FULL_SIZES, size, encoder, dtype), dataset.layouts)  # type: ignore[arg-type]

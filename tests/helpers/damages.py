@@ -1,4 +1,4 @@
-"""Ways in which a file can be damaged."""
+"""Functions that damage a file in different ways."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ class Handler(BaseHTTPRequestHandler):
         while size := int(self._read_line().split(b";")[0], 16):
             chunks.append(self._read(size))
             self._read_line()
-        while self._read_line().strip():  # trailers
+        while self._read_line().strip():  # skip trailers
             pass
         return b"".join(chunks)
 

@@ -161,10 +161,10 @@ def test_causal_attention_equals_attention_with_a_mask(monkeypatch):
     """Values and gradients agree to float32 rounding, also if attention is computed in blocks of rows."""
     q, k, v, to = np.random.default_rng(0).normal(size=(4, 2, 15, 2, 8)).astype(np.float32)
 
-    def of_mask(q, k, v):
+    def masked(q, k, v):
         return jax.nn.dot_product_attention(q, k, v, mask=jnp.asarray(query_mask(7))[None, None])
 
-    def ours(q, k, v):
+    def unmasked(q, k, v):
         context = attention.causal_attention(q[:, :7], k[:, :7], v[:, :7])
         queries = attention.causal_attention(q[:, 7:], k[:, :7], v[:, :7], k[:, 7:], v[:, 7:])
         return jnp.concatenate([context, queries], axis=1)
@@ -172,11 +172,11 @@ def test_causal_attention_equals_attention_with_a_mask(monkeypatch):
     def results(attend):
         return jax.jit(jax.value_and_grad(lambda *qkv: (attend(*qkv) * to).sum(), argnums=(0, 1, 2)))(q, k, v)
 
-    expected = results(of_mask)
+    expected = results(masked)
     for short, long in ((attention.SHORT_ROWS, attention.LONG_ROWS), (3, 15), (3, 5)):
         monkeypatch.setattr(attention, "SHORT_ROWS", short)
         monkeypatch.setattr(attention, "LONG_ROWS", long)
-        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-5, atol=5e-6), results(ours), expected)
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-5, atol=5e-6), results(unmasked), expected)
 
 
 def arrays_in(jaxpr: Any) -> Iterator[Any]:
@@ -207,14 +207,14 @@ def test_padding_does_not_change_the_loss(name):
     other = jax.tree.map(lambda a, b: np.where(mask.reshape(3, 7, *[1] * (a.ndim - 2)), a, b), batch, garbage)
     batch, other = (b._replace(attention_mask=mask) for b in (batch, other))
 
-    def of(batch):
+    def loss_of(batch):
         return method.loss(params, params, batch, None)
 
-    loss = jax.jit(of)
+    loss = jax.jit(loss_of)
     assert loss(batch)[0] != loss(batch._replace(attention_mask=np.ones_like(mask)))[0]
     for one, two in zip(*(jax.tree.leaves(loss(b)) for b in (batch, other)), strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-6)
-    gradient = jax.jit(jax.grad(lambda obs: of(batch._replace(obs=obs))[0]))(batch.obs)
+    gradient = jax.jit(jax.grad(lambda obs: loss_of(batch._replace(obs=obs))[0]))(batch.obs)
     assert not np.abs(gradient)[~mask].any()
 
 

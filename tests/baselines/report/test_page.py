@@ -25,7 +25,7 @@ from icrl4aht_data.errors import OptionError
 from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 
-GIF = b"GIF89a"  # the page does not decode the image
+GIF = b"GIF89a"  # no complete image, since the report does not decode it
 EVIL = '<img src=x onerror="alert(1)">&co'
 
 

@@ -39,7 +39,7 @@ def random_rollouts(length: int, updates: int) -> list[Rollout]:
     rng = np.random.default_rng(length)
     shape = (length, ENVS)
 
-    def one() -> Rollout:
+    def one_rollout() -> Rollout:
         fields: dict[str, Any] = {
             "record": rng.integers(0, UNTOUCHED, (*shape, record_size(LAYOUT)), np.uint8),
             "actions": rng.integers(0, 6, (*shape, 2), np.int32),
@@ -48,7 +48,7 @@ def random_rollouts(length: int, updates: int) -> list[Rollout]:
         rest: dict[str, Any] = {name: rng.normal(size=shape) for name in Rollout._fields if name not in fields}
         return Rollout(**fields, **rest)
 
-    return [one() for _ in range(updates)]
+    return [one_rollout() for _ in range(updates)]
 
 
 def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:

@@ -96,7 +96,7 @@ def test_generated_layouts_have_allowed_fixtures_and_recipes(family, drawn):
     assert len(shown) == 8, "with and without recipe indicators, buttons and the delivery indicator"
 
 
-def test_layouts_of_family_rooms_are_small_and_mostly_shared(drawn):
+def test_layouts_of_family_rooms_are_small_and_a_third_separates_agents(drawn):
     published = published_rooms(False) | published_rooms(True)
     assert len(published) == 7  # some layouts, such as coord_simple and test_simple, have equal floor
     for layout in drawn["rooms"]:

@@ -52,7 +52,7 @@ class Updated(NamedTuple):
     rollout: Rollout
 
 
-def updated(algorithm: Algorithm, learning: bool = True) -> Updated:
+def second_update(algorithm: Algorithm, learning: bool = True) -> Updated:
     """Return the second update of a population, in which the learning rate's warm-up is over.
 
     Without `learning`, policies do not change, so the update compiles in a third of the time.
@@ -80,18 +80,18 @@ def updated(algorithm: Algorithm, learning: bool = True) -> Updated:
 
 @pytest.fixture(scope="module")
 def comedi() -> Updated:
-    return updated(CoMeDi())
+    return second_update(CoMeDi())
 
 
 @pytest.fixture(scope="module")
 def comedi_play() -> Updated:
     """Return an update of CoMeDi in which no policy changes."""
-    return updated(CoMeDi(), learning=False)
+    return second_update(CoMeDi(), learning=False)
 
 
 @pytest.fixture(scope="module")
 def lbrdiv() -> Updated:
-    return updated(LBRDiv(2))
+    return second_update(LBRDiv(2))
 
 
 @pytest.fixture(params=[pytest.param("comedi", marks=pytest.mark.slow), "lbrdiv"])

@@ -39,26 +39,26 @@ from tests.helpers.damages import flip_bit
 from tests.helpers.tiny import artefact
 
 
-def in_episodes(*means: float, spread: float = 0.0) -> np.ndarray:
+def returns_with_means(*means: float, spread: float = 0.0) -> np.ndarray:
     """Return returns (C, E) with the given means; `spread` is the standard deviation of differences of checkpoints."""
     noise = np.random.default_rng(0).normal(size=(len(means), LABEL_EPISODES)) * spread / np.sqrt(2)
     return np.array(means)[:, None] + noise - noise.mean(axis=1, keepdims=True)
 
 
 def test_last_checkpoint_labels_unless_an_earlier_one_is_clearly_better():
-    assert choose_checkpoint(in_episodes(0, 5, 10, 20, 20)) == 4
-    assert choose_checkpoint(in_episodes(0, 0, 0, 0, 0)) == 4
-    assert choose_checkpoint(in_episodes(7)) == 0
-    assert choose_checkpoint(in_episodes(0, 5, 16.9, 3, 0)) == 2
-    assert choose_checkpoint(in_episodes(9, 5, 9, 3, 0)) == 2  # the later of two equal checkpoints
+    assert choose_checkpoint(returns_with_means(0, 5, 10, 20, 20)) == 4
+    assert choose_checkpoint(returns_with_means(0, 0, 0, 0, 0)) == 4
+    assert choose_checkpoint(returns_with_means(7)) == 0
+    assert choose_checkpoint(returns_with_means(0, 5, 16.9, 3, 0)) == 2
+    assert choose_checkpoint(returns_with_means(9, 5, 9, 3, 0)) == 2  # the later of two equal checkpoints
 
 
 def test_earlier_checkpoint_must_be_better_by_2_and_by_two_standard_errors():
-    assert choose_checkpoint(in_episodes(1.9, 0)) == 1
-    assert choose_checkpoint(in_episodes(2.1, 0)) == 0
+    assert choose_checkpoint(returns_with_means(1.9, 0)) == 1
+    assert choose_checkpoint(returns_with_means(2.1, 0)) == 0
     error = 5 / 2.1  # a difference of 5 is 2.1 standard errors
-    assert choose_checkpoint(in_episodes(5, 0, spread=error * np.sqrt(LABEL_EPISODES))) == 0
-    assert choose_checkpoint(in_episodes(5, 0, spread=error * np.sqrt(LABEL_EPISODES) * 1.2)) == 1
+    assert choose_checkpoint(returns_with_means(5, 0, spread=error * np.sqrt(LABEL_EPISODES))) == 0
+    assert choose_checkpoint(returns_with_means(5, 0, spread=error * np.sqrt(LABEL_EPISODES) * 1.2)) == 1
 
 
 @pytest.fixture

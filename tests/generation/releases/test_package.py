@@ -132,7 +132,7 @@ def test_oracle_labels_are_omitted_if_the_oracle_earns_less_than_learners(two_le
     assert not dataset.has_labels("oracle").any()
 
 
-def test_streams_without_headroom_are_kept_without_improvement(two_learners, profile, tmp_path):
+def test_least_improvement_is_not_required_without_headroom(two_learners, profile, tmp_path):
     task_id = two_learners[0].task.task_id
     root = pack(tmp_path, replace(profile, least_improvement=50.0), two_learners, {task_id: DOES_NOT})
     kept = [(entry.learner, entry.env_idx) for entry in load_icrl4aht(root).entries]
@@ -215,7 +215,7 @@ def fake_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
     return [Draw(layout, family, base_seed, k, "H3/t1", distance, k, 0.0, 1.0, 30.0) for k in range(2)]
 
 
-def test_facts_of_drawn_teammates_are_stored_and_others_measured_once(tmp_path, monkeypatch):
+def test_drawn_teammates_have_stored_facts_and_others_are_measured_once(tmp_path, monkeypatch):
     monkeypatch.setattr(draws_table, "read_draws", fake_draws)
     entry = sample_teammate("assembly_line", 1, "train")
     drawn = make_task("teammate", "train", "demo_wide", entry, 0)

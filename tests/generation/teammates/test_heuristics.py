@@ -232,7 +232,7 @@ def test_every_family_plays_every_layout_as_both_agents(name):
 
 # Single actions without noise, for rules that the published play does not reach.
 
-ZERO, ONE = 4, 16  # ingredients 0 and 1 in the layouts below
+ZERO, ONE = 4, 16  # item bytes of ingredients 0 and 1
 SOUP_0 = 3 * ZERO | COOKED
 DISH_0 = SOUP_0 | PLATE
 MIXED = 2 * ZERO + ONE
