@@ -61,7 +61,7 @@ def some_keys(number: int) -> jax.Array:
     return jax.random.split(jax.random.key(number), N)
 
 
-def at_goal(state: EnvState) -> EnvState:
+def move_to_goal(state: EnvState) -> EnvState:
     """Change environments on cramped_up: the teammate faces the goal with a dish of the current recipe."""
     where, recipes = columns(CRAMPED), fields(CRAMPED, state.record).recipe
     records = np.repeat(state_record(CRAMPED, (1, 1, "up"), (3, 2, "down")), len(recipes), axis=0)
@@ -84,7 +84,7 @@ def step_batch(compiled: Compiled, keys: jax.Array, actions: np.ndarray) -> Step
     actions = actions.copy()
     for number in range(len(actions)):
         if number % MAX_STEPS == 1:
-            state = at_goal(state)
+            state = move_to_goal(state)
             actions[number] = STAY, INTERACT
         before.append(state)
         steps.append(compiled.step(state, jnp.asarray(actions[number])))
@@ -213,7 +213,7 @@ def transitions(compiled: Compiled, seed: int, deliveries: int) -> np.ndarray:
     """Deliver in every step; return recipes before and after each correct delivery, shape (deliveries * N, 2)."""
     state, pairs = compiled.init(some_keys(seed)), []
     for _ in range(deliveries):
-        state = at_goal(state)
+        state = move_to_goal(state)
         step = compiled.step(state, jnp.asarray(np.tile(np.array([STAY, INTERACT], np.int32), (N, 1))))
         assert (np.asarray(step.reward) == 20).all()
         assert (fields(CRAMPED, step.final).delivered == 1).all()
@@ -259,7 +259,7 @@ def test_custom_recipes_are_drawn_at_starts_and_after_deliveries():
         for name, layout in LAYOUTS.items()
     ],
 )
-def in_jax(request: pytest.FixtureRequest):
+def jitted_rules(request: pytest.FixtureRequest):
     """Return a layout, and a jitted function that steps the rules and observes the state before the step."""
     layout = request.param
     return layout, jax.jit(lambda *inputs: (*rules.step(layout, *inputs), observe_both(layout, inputs[0])))
@@ -281,8 +281,8 @@ def assert_same_bytes(found: Sequence, expected: Sequence) -> None:
         np.testing.assert_array_equal(np.asarray(ours), np.asarray(theirs))
 
 
-def test_rules_and_observations_are_equal_in_numpy_and_jax(in_jax):
-    layout, jitted = in_jax
+def test_rules_and_observations_are_equal_in_numpy_and_jax(jitted_rules):
+    layout, jitted = jitted_rules
     inputs = random_inputs(layout, 3072)
     outcome = rules.step(layout, *inputs)
     ours = (*outcome, observe_both(layout, inputs[0]))

@@ -63,7 +63,7 @@ def test_episodes_depend_only_on_seed_and_actions(env):
     assert not np.array_equal(first[0], env.reset()[1]["state"])
 
 
-def bundled(**filters) -> tuple:
+def first_history(**filters) -> tuple:
     dataset = load_icrl4aht(obs="uint8", **filters)
     return dataset, dataset[0]
 
@@ -90,7 +90,7 @@ def replay(env, history, episode: int, options: dict[str, Any]) -> tuple[np.ndar
     ids=str,
 )
 def test_recorded_actions_reproduce_the_recorded_history(filters):
-    dataset, history = bundled(**filters)
+    dataset, history = first_history(**filters)
     recovered = dataset.recover_environment(history.entry.history_id)
     assert recovered.spec.max_episode_steps == 400
     returns = history.returns()
@@ -105,14 +105,14 @@ def test_recorded_actions_reproduce_the_recorded_history(filters):
 @pytest.mark.parametrize("source", ["ppo", pytest.param("noise", marks=pytest.mark.slow)])
 def test_recovered_keys_reproduce_actions_of_heuristic_teammates(source):
     """With the random keys of a recorded episode, the teammate's policy takes the recorded actions."""
-    dataset, history = bundled(layout="demo_wide", source=source, teammate_family=["H1", "H2", "H3", "H4"])
+    dataset, history = first_history(layout="demo_wide", source=source, teammate_family=["H1", "H2", "H3", "H4"])
     recovered = dataset.recover_environment(history.entry.history_id)
     for episode in (0, int(history.returns().argmax())):
         replay(recovered, history, episode, recorded_draws(dataset, history.entry.history_id, episode))
 
 
 def test_teammate_policy_acts_after_the_given_actions_end():
-    dataset, history = bundled(layout="demo_wide", source="noise")
+    dataset, history = first_history(layout="demo_wide", source="noise")
     recovered = dataset.recover_environment(history.entry.history_id)
     number = history.entry.history_id
     scripted = {name: array[:50] for name, array in dataset.reset_options(number).items() if name != "state"}
@@ -129,7 +129,7 @@ def test_recovering_keys_of_unknown_recording_code_raises_error(lite):
 
 
 def test_recovered_environments_accept_length_and_render_mode():
-    dataset, history = bundled(layout="demo_wide", source="noise", channels="canonical")
+    dataset, history = first_history(layout="demo_wide", source="noise", channels="canonical")
     recovered = dataset.recover_environment(history.entry.history_id, max_episode_steps=3, render_mode="rgb_array")
     assert recovered.observation_space.shape == (5, 5, 46)
     np.testing.assert_array_equal(recovered.reset(options={"state": history.state[0]})[0], history.obs[0])
@@ -143,7 +143,7 @@ def test_recovering_environment_of_release_without_tasks_raises_error(converted_
 
 
 def test_episode_number_out_of_range_raises_error():
-    dataset, history = bundled(layout="demo_wide", source="noise")
+    dataset, history = first_history(layout="demo_wide", source="noise")
     with pytest.raises(OptionError, match=r"episode = 40: history \d+ has episodes 0\.\.39"):
         dataset.reset_options(history.entry.history_id, 40)
     with pytest.raises(OptionError, match="episode = -1"):

@@ -51,7 +51,7 @@ def random_rollouts(length: int, updates: int) -> list[Rollout]:
     return [one_rollout() for _ in range(updates)]
 
 
-def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
+def record_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
     """Record step by step: the first 100 of each 400 steps, and the state after the 100 steps."""
     kept = empty_histories(config)
     for update, rollout in enumerate(rollouts):
@@ -77,7 +77,7 @@ def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
 def test_recorded_arrays_equal_those_of_a_loop_over_steps(length, updates):
     config = make_config(length, updates)
     rollouts = random_rollouts(length, updates)
-    expected = kept_by_loop(rollouts, config)
+    expected = record_by_loop(rollouts, config)
     found = empty_histories(config)
     for number, rollout in enumerate(rollouts):
         record_rollout(found, number, rollout)
@@ -107,7 +107,7 @@ def rewards_of(returns: list[list[int]]) -> np.ndarray:
     return rewards.reshape(len(returns), -1)
 
 
-def best(returns: list[list[int]], keep: int, least_improvement: float | None = None) -> list[int]:
+def best_of(returns: list[list[int]], keep: int, least_improvement: float | None = None) -> list[int]:
     return curate.best_streams(curate.stream_returns(rewards_of(returns)), keep, least_improvement).tolist()
 
 
@@ -124,16 +124,16 @@ def test_best_streams_have_the_highest_end_plus_improvement(episodes):
     scores = [score_by_hand(curve) for curve in returns]
     assert len(set(scores)) > 20
     expected = sorted(range(30), key=lambda n: -scores[n])
-    assert best(returns, 30) == expected
-    assert best(returns, 7) == expected[:7]
+    assert best_of(returns, 30) == expected
+    assert best_of(returns, 7) == expected[:7]
 
 
 def test_streams_with_equal_scores_are_ordered_by_number():
     low, high, also_high = [0] * 10, [0] * 5 + [20] * 5, [10] * 5 + [25] * 5  # scores 0, 40 and 40
     curves = [low, high, low, also_high, high, low]
-    assert best(curves, 6) == [1, 3, 4, 0, 2, 5]
-    assert best(curves, 2) == [1, 3]
-    assert best([low] * 100 + [high] * 100, 200) == [*range(100, 200), *range(100)]
+    assert best_of(curves, 6) == [1, 3, 4, 0, 2, 5]
+    assert best_of(curves, 2) == [1, 3]
+    assert best_of([low] * 100 + [high] * 100, 200) == [*range(100, 200), *range(100)]
 
 
 def learner(*improvements: int) -> np.ndarray:

@@ -74,7 +74,7 @@ def test_two_generate_commands_at_once_collect_each_task_once(built, pair, tmp_p
     assert not compare_rebuilds(tmp_path, pair).differences
 
 
-def listening(process: psutil.Process) -> set[str]:
+def listening_addresses(process: psutil.Process) -> set[str]:
     """Return the IP addresses on which a process and its children listen."""
     found = set()
     for child in [process, *process.children(recursive=True)]:
@@ -97,7 +97,7 @@ def test_two_ray_workers_collect_bit_equal_tasks(built, pair, tmp_path):
     addresses: set[str] = set()
     process = start(*command)
     while process.poll() is None:
-        addresses |= listening(psutil.Process(process.pid))
+        addresses |= listening_addresses(psutil.Process(process.pid))
         time.sleep(0.5)  # listing all connections takes much CPU time
     output, errors = process.communicate()
     assert process.returncode == 1, output + errors

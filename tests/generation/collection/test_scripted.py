@@ -194,7 +194,7 @@ def test_full_disk_leaves_no_files_of_a_scripted_task(profile, tmp_path):
     assert not partial_folder(job.folder).exists()
 
 
-def searched(profile: Profile, folder: Path, dish: tuple[int, int, int]) -> dict[str, np.ndarray]:
+def search_histories(profile: Profile, folder: Path, dish: tuple[int, int, int]) -> dict[str, np.ndarray]:
     """Return histories of the searching script in a task with one wanted recipe and a teammate that only watches."""
     work = Work(make_task("preference", "train", "asymm_both_plain", WATCHER, 5, [dish]), "search")
     job = CollectionJob(work, profile, folder)
@@ -206,7 +206,7 @@ def searched(profile: Profile, folder: Path, dish: tuple[int, int, int]) -> dict
 def test_searching_script_finds_and_remembers_the_wanted_recipe(profile, tmp_path):
     config = replace(SEARCH, histories=8, episodes=10, start=(0.0, 0.0))
     exact = replace(profile, search=config)
-    one, other = (searched(exact, tmp_path, dish) for dish in ((0, 0, 0), (1, 1, 1)))
+    one, other = (search_histories(exact, tmp_path, dish) for dish in ((0, 0, 0), (1, 1, 1)))
     for found in (one, other):
         np.testing.assert_array_equal(found["actions"], found["script_actions"])
         returns = found["rewards"].reshape(8, 10, 100).sum(axis=-1)

@@ -40,7 +40,7 @@ FAMILY_ON = {
 }
 
 
-def by_layout(*names: str) -> list[Any]:
+def layout_params(*names: str) -> list[Any]:
     """Return test parameters for layouts; all but asymm_right are marked slow."""
     return [pytest.param(name, marks=[] if name == "asymm_right" else [pytest.mark.slow]) for name in names]
 
@@ -60,19 +60,19 @@ def episodes(agent: str, layout: str) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return record, actions, reward
 
 
-@pytest.mark.parametrize("layout", by_layout(*FAMILY_ON))
+@pytest.mark.parametrize("layout", layout_params(*FAMILY_ON))
 def test_oracle_never_presses_buttons_or_delivers_wrong_dishes(layout):
     record, actions, _ = episodes("oracle", layout)
     events = step(LAYOUTS[layout], record, actions, record[..., 6]).events[..., EGO]
     assert not (events & (PRESSED | WRONG)).any()
 
 
-@pytest.mark.parametrize("layout", by_layout("coord_simple", "test_simple"))
+@pytest.mark.parametrize("layout", layout_params("coord_simple", "test_simple"))
 def test_oracle_stays_if_the_agents_can_share_no_items(layout):
     assert (episodes("oracle", layout)[1][..., EGO] == STAY).all()
 
 
-@pytest.mark.parametrize("layout", by_layout("test_wide", "asymm_right", "cramped_down"))
+@pytest.mark.parametrize("layout", layout_params("test_wide", "asymm_right", "cramped_down"))
 def test_oracle_earns_more_than_h4_in_the_same_slot(layout):
     oracle, other = (episodes(agent, layout)[2].sum(axis=1).mean() for agent in ("oracle", "h4"))
     assert oracle > other

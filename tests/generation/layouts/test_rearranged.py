@@ -15,7 +15,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 TRAINING = TRACKS["layout"]["train"]
 
 
-def reached(layout):
+def facing_counts(layout):
     """Return how many fixtures of each map letter each set of agents can face."""
     found = Counter()
     for cell, letter in enumerate("".join(layout.rows)):
@@ -45,7 +45,7 @@ def test_rearranged_fixtures_stay_reachable_for_the_same_agents(name):
     others = rearranged_layouts(layout, 6)
     assert len(others) == 6
     for other in others:
-        assert reached(other) == reached(layout)
+        assert facing_counts(other) == facing_counts(layout)
         assert [room.tolist() for room in other.rooms] == [room.tolist() for room in layout.rooms]
     assert [len(other.recipes) for other in others] == [2, 4, 2, 4, 2, 4]
 

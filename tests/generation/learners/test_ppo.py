@@ -129,12 +129,12 @@ def trained(update, untrained) -> Played:
     return play(update, untrained, CONFIG.updates)
 
 
-def egos(rollout: Rollout) -> Choice:
+def ego_choices(rollout: Rollout) -> Choice:
     """Return the ego's actions, log-probabilities and values in a roll-out."""
     return rollout.choices[EGO]
 
 
-def egos_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
+def ego_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
     """Return the training sequences of the ego in the roll-out that starts in the given state."""
     slots, hidden = np.arange(CONFIG.environments), state.carry.memories[EGO]
     view = CompactView("paper", (CLOSET,))
@@ -171,7 +171,7 @@ def test_generalised_advantage_equals_a_loop_over_steps(gamma, lam):
 
 def replay(learner: Learner, state: LearnerState, rollout: Rollout, reset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the network's log-probabilities and values on the ego's training sequences."""
-    own = egos_sequences(state, rollout)
+    own = ego_sequences(state, rollout)
     output: Any = jax.jit(learner.network.apply)(state.params, own.hidden[0], own.seen, reset)
     log_probs = np.asarray(jax.nn.log_softmax(output[1]))
     return np.take_along_axis(log_probs, np.asarray(own.action)[..., None], axis=-1)[..., 0], np.asarray(output[2])
@@ -184,11 +184,11 @@ def test_training_sequences_replay_a_roll_out_across_episodes(learner, played):
     np.testing.assert_array_equal(rollout.done.nonzero()[0], [3] * 4)
     assert np.abs(state.carry.memories[EGO]).min() > 0
     log_prob, value = replay(learner, state, rollout, rollout.reset)
-    np.testing.assert_allclose(log_prob, egos(rollout).log_prob, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(value, egos(rollout).value, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(log_prob, ego_choices(rollout).log_prob, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(value, ego_choices(rollout).value, rtol=0, atol=1e-4)
     # With resets at the last step of an episode instead of the first step, values are wrong from this step on.
     _, value = replay(learner, state, rollout, rollout.done)
-    wrong = np.abs(value - egos(rollout).value).max(axis=1)
+    wrong = np.abs(value - ego_choices(rollout).value).max(axis=1)
     assert wrong[:3].max() < 1e-4 < 1e-2 < wrong[3:].min()
 
 
@@ -200,7 +200,7 @@ def test_ppo_loss_equals_formulas_in_numpy(learner, played):
     hidden = played.before[1].carry.memories[EGO]
     advantage, target = rng.normal(size=(2, *rollout.done.shape)).astype(np.float32)
     weight = np.array([1.0, -1.0, 0.5, -2.0], np.float32)  # negative weights lower returns
-    own = egos_sequences(played.before[1], rollout)._replace(weight=weight[None])
+    own = ego_sequences(played.before[1], rollout)._replace(weight=weight[None])
     batch = jax.tree.map(jnp.asarray, Batch(own, advantage, target))
     total, parts = jax.jit(learner.ppo.loss)(params, batch)
 
@@ -209,12 +209,12 @@ def test_ppo_loss_equals_formulas_in_numpy(learner, played):
     logits, value = np.asarray(output[1], np.float64), np.asarray(output[2], np.float64)
     log_probs = logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))
     chosen = np.take_along_axis(log_probs, rollout.actions[..., EGO, None], axis=-1)[..., 0]
-    ratio = np.exp(chosen - egos(rollout).log_prob)
-    change = value - egos(rollout).value
+    ratio = np.exp(chosen - ego_choices(rollout).log_prob)
+    change = value - ego_choices(rollout).value
     assert (np.abs(ratio - 1) > CONFIG.clip).any() and (np.abs(change) > CONFIG.clip).any()
     normalised = (advantage - advantage.mean()) / advantage.std() * weight
     policy = -np.minimum(ratio * normalised, np.clip(ratio, 0.8, 1.2) * normalised).mean()
-    near = egos(rollout).value + np.clip(change, -0.2, 0.2)
+    near = ego_choices(rollout).value + np.clip(change, -0.2, 0.2)
     value_loss = 0.5 * np.maximum((value - target) ** 2, (near - target) ** 2).mean()
     entropy = -(np.exp(log_probs) * log_probs).sum(axis=-1).mean()
     expected = {"policy_loss": policy, "value_loss": value_loss, "entropy": entropy}
@@ -288,7 +288,7 @@ REWARDS = np.array([-20, -25, -30, -10, -5, 0, 20, 15], np.float32)
 delivery with 0 and 1 press."""
 
 
-def rewarded() -> Rollout:
+def rewarded_rollout() -> Rollout:
     """Return a roll-out of two environments with `REWARDS`; agent a has the shaped reward a + 1 in every step."""
     size = (len(REWARDS), 2)
     zeros, choices = jnp.zeros(size), jnp.zeros((len(REWARDS), 4))
@@ -311,7 +311,7 @@ def test_forgiveness_offsets_wrong_deliveries_while_rewards_are_shaped():
     for weight, forgiven in ((1.0, 20), (0.25, 5), (0.0, 0)):
         found = sequences(
             lambda records: records,  # type: ignore[arg-type]
-            rewarded(),
+            rewarded_rollout(),
             0,
             slots,
             jnp.zeros((4, 8)),

@@ -26,21 +26,21 @@ def count(params, key) -> jax.Array:
     return jnp.int32(0)
 
 
-def turning(params, steps, view, key):
+def act_by_view(params, steps, view, key):
     """Return an action that depends on the number of steps and the observation."""
     return (params["turn"] + steps + view.sum(dtype=jnp.int32)) % 6, steps + 1
 
 
-def by_state(params, steps, view, key):
+def act_by_state(params, steps, view, key):
     """Return an action that depends on the parameter and the position of agent 1."""
     return (view[1].astype(jnp.int32) + params["turn"]) % 6, steps
 
 
-def policy(turn: int, act: Any = turning) -> Policy:
-    return Policy({"turn": jnp.int32(turn)}, count, act, "state" if act is by_state else "observation")
+def policy(turn: int, act: Any = act_by_view) -> Policy:
+    return Policy({"turn": jnp.int32(turn)}, count, act, "state" if act is act_by_state else "observation")
 
 
-POLICIES = [policy(0), policy(1, by_state), policy(0), policy(1)]
+POLICIES = [policy(0), policy(1, act_by_state), policy(0), policy(1)]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -98,7 +98,7 @@ def test_only_identical_policies_have_distance_0(actions):
 def test_actions_on_common_states_use_teammate_observations_and_memory(records, monkeypatch):
     """Compare with expected actions: memory starts with each episode, and observations are the teammate's."""
     monkeypatch.setattr(build, "_visited_records", lambda env, numbers, family, key: records)
-    found = actions_on_common_states(LAYOUT, [policy(2), policy(1, by_state)], steps=STEPS)
+    found = actions_on_common_states(LAYOUT, [policy(2), policy(1, act_by_state)], steps=STEPS)
     repeated = np.concatenate([records, records], axis=1)  # policies have two families
     seen = observe(LAYOUT, repeated, TEAMMATE).sum(axis=(2, 3, 4))
     expected = (2 + np.arange(STEPS)[:, None] + seen) % 6

@@ -59,13 +59,13 @@ def count(params, key) -> jax.Array:
     return jnp.int32(0)
 
 
-def walks(params, steps, view, key):
+def act_by_parameter(params, steps, view, key):
     """Return the action that the parameter gives."""
     return params, steps + 1
 
 
-def walks_too(params, steps, view, key):
-    """Return the action that the parameter gives, like `walks`, as a different function."""
+def act_by_parameter_too(params, steps, view, key):
+    """Return the action that the parameter gives, like `act_by_parameter`, as a different function."""
     return params, steps + 1
 
 
@@ -82,7 +82,7 @@ def test_reference_returns_are_in_the_order_of_the_teammates(monkeypatch):
     monkeypatch.setattr(references, "roll_out", counted)
     monkeypatch.setitem(references.REFERENCE_EGOS, "oracle", other)
     monkeypatch.setattr(references, "KEPT_STEPS", 3)
-    actions = {0: walks, 2: walks_too, 5: walks}
+    actions = {0: act_by_parameter, 2: act_by_parameter_too, 5: act_by_parameter}
     mates = [Policy(jnp.int32(action), count, act, "state") for action, act in actions.items()]
     found = reference_returns(LAYOUT, mates, episodes=2)
     stay, random, oracle = found.T

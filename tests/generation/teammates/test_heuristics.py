@@ -98,7 +98,7 @@ def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.
     recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, episodes + 1))
     recipes[:, -1] = layout.recipe_items[0]
 
-    def one(params, record, recipes):
+    def play_episode(params, record, recipes):
         def step(carry, recipe):
             record, memory = carry
             action, memory = policy.act(params, memory, record, jax.random.key(0))
@@ -107,7 +107,7 @@ def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.
 
         return jax.lax.scan(step, (record, policy.init(params, jax.random.key(99))), recipes)[1]
 
-    batch = jax.vmap(jax.vmap(one, (None, 0, 1), 1), (0, None, None), 1)
+    batch = jax.vmap(jax.vmap(play_episode, (None, 0, 1), 1), (0, None, None), 1)
     run = jax.jit(batch)
     params = stacked(family, [entry["theta"] for entry in entries])
     actions, rewards = run(params, np.concatenate([records, pinned]), recipes)
@@ -357,7 +357,7 @@ UNSIGNED = Layout("unsigned", "test_unsigned", ("WWLWPWW", "0A   AX", "1     B",
 SURE = {"press_L_when_unknown": 1.0, "cost_sensitivity": 0.0}
 
 
-def links(key: jax.Array, n: int) -> list[int]:
+def split_key(key: jax.Array, n: int) -> list[int]:
     """Return the data of a key after n splits that keep the first of the two new keys."""
     for _ in range(n):
         key = jax.random.split(key)[0]
@@ -381,5 +381,5 @@ def test_h1_presses_the_button_to_see_the_recipe(theta, memory, fields, expected
     action, after = one_step(UNSIGNED, H1, 1, theta, (4, 1, "up", 0), (5, 2, "up", 0), memory, **fields)
     assert action == expected
     start = first_memories(UNSIGNED, ((H1, 1),))[H1, 1].key[0]
-    assert jax.random.key_data(after.key).tolist() == links(start, steps)
+    assert jax.random.key_data(after.key).tolist() == split_key(start, steps)
     assert int(after.recipe) == (3 * ZERO if fields.get("buttons") else memory.get("recipe", 0))

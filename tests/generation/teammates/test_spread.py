@@ -165,7 +165,7 @@ def always_interact(params, memory, scene):
 SIMPLE = Heuristic("simple", lambda key: (), always_interact, {"a": 0.5}, {}, Sampling((), {}), Sampling((), {}), {})
 
 
-def acted(theta: dict[str, float], noise: Noise = "seeded", seed: int = 0, steps: int = 600) -> np.ndarray:
+def actions_of(theta: dict[str, float], noise: Noise = "seeded", seed: int = 0, steps: int = 600) -> np.ndarray:
     """Return the actions of the heuristic `SIMPLE` in one episode."""
     policy = SIMPLE.build(None, theta, noise=noise)
     layout = get_layout("cramped_up")
@@ -180,8 +180,8 @@ def acted(theta: dict[str, float], noise: Noise = "seeded", seed: int = 0, steps
 
 
 def test_teammate_acts_randomly_with_the_given_probability():
-    assert set(acted({"a": 0.5, RANDOM_ACTIONS: 0.0})) == {5} == set(acted({"a": 0.5}))
-    half, whole = (acted({"a": 0.5, RANDOM_ACTIONS: chance}) for chance in (0.5, 1.0))
+    assert set(actions_of({"a": 0.5, RANDOM_ACTIONS: 0.0})) == {5} == set(actions_of({"a": 0.5}))
+    half, whole = (actions_of({"a": 0.5, RANDOM_ACTIONS: chance}) for chance in (0.5, 1.0))
     assert abs((half != 5).mean() - 0.5 * 5 / 6) < 0.08
     assert all(abs((whole == action).mean() - 1 / 6) < 0.07 for action in range(6))
     np.testing.assert_array_equal(half[half != 5], whole[half != 5])  # with equal random numbers
@@ -189,8 +189,8 @@ def test_teammate_acts_randomly_with_the_given_probability():
 
 def test_random_actions_with_fixed_noise_repeat_in_every_episode():
     theta = {"a": 0.5, RANDOM_ACTIONS: 0.5}
-    np.testing.assert_array_equal(acted(theta, "fixed", 1), acted(theta, "fixed", 2))
-    assert (acted(theta, "seeded", 1) != acted(theta, "seeded", 2)).any()
+    np.testing.assert_array_equal(actions_of(theta, "fixed", 1), actions_of(theta, "fixed", 2))
+    assert (actions_of(theta, "seeded", 1) != actions_of(theta, "seeded", 2)).any()
 
 
 def test_probability_of_random_actions_above_1_raises_error():

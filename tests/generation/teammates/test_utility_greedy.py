@@ -34,7 +34,7 @@ def _memory(rolls: list[int], intent: int = -1, wait: int = 0) -> GreedyMemory:
     return GreedyMemory(key, jnp.full(8, intent), jnp.full(8, wait))
 
 
-def _heading_up(slot: int, partner: tuple[int, int, str]) -> np.ndarray:
+def _moving_up(slot: int, partner: tuple[int, int, str]) -> np.ndarray:
     """Return eight equal records (8, S): H4 with empty hands at (1, 2) wants to move up, towards pile 0."""
     mover = (1, 2, "up")
     record = state_record(LAYOUTS["cramped_up"], *((mover, partner) if slot == 0 else (partner, mover)))
@@ -43,12 +43,12 @@ def _heading_up(slot: int, partner: tuple[int, int, str]) -> np.ndarray:
 
 @pytest.mark.parametrize("slot", [0, 1])
 def test_h4_yields_only_if_its_next_cell_is_adjacent_to_the_partner(slot):
-    actions, after = _act(slot)(_memory(ROLLS), _heading_up(slot, (2, 1, "down")))
+    actions, after = _act(slot)(_memory(ROLLS), _moving_up(slot, (2, 1, "down")))
     yields = [roll < (20, 40)[slot] for roll in ROLLS]
     assert actions.tolist() == [STAY if y else UP for y in yields]
     assert after.wait.tolist() == [1 + roll % 2 if y else 0 for y, roll in zip(yields, ROLLS, strict=True)]
     assert after.intent.tolist() == [utility_greedy.FETCH] * 8
-    actions, after = _act(slot)(_memory(ROLLS), _heading_up(slot, (3, 2, "down")))
+    actions, after = _act(slot)(_memory(ROLLS), _moving_up(slot, (3, 2, "down")))
     assert (actions.tolist(), after.wait.tolist()) == ([UP] * 8, [0] * 8)
 
 
@@ -56,7 +56,7 @@ def test_waiting_h4_keeps_its_intent_and_advances_its_random_key():
     memory = _memory(ROLLS, intent=utility_greedy.PRESS, wait=2)
     keys = [memory.key]
     for wait in (1, 0):
-        actions, memory = _act(1)(memory, _heading_up(1, (2, 1, "down")))
+        actions, memory = _act(1)(memory, _moving_up(1, (2, 1, "down")))
         keys.append(memory.key)
         assert actions.tolist() == [STAY] * 8
         assert memory.wait.tolist() == [wait] * 8
