@@ -1,4 +1,4 @@
-"""Settings of every test, and releases that many tests read."""
+"""Settings for all tests, and fixtures with releases that many tests read."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ from tests.helpers.two_sources import two_source_release
 from tests.helpers.xla_flags import add_xla_flag, is_xla_flag
 
 COMPILATIONS: list[float] = []
-"""Seconds of each compilation of this process."""
+"""Seconds that each JAX compilation in this process took."""
 
 MEMORY_TO_FREE = 1200 * 2**20
-"""Bytes of a worker from which on it drops compiled programs."""
+"""Memory in bytes above which a test worker clears JAX's compiled programs."""
 
 SharedFolder = Callable[[str, Callable[[Path], object]], Path]
 COMPILATION_CACHE: dict[str, Any] = {
     "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".cache" / "jax"),
-    "jax_compilation_cache_max_size": 2 * 2**30,  # with a limit JAX locks the folder, so that processes can share it
-    "jax_persistent_cache_min_compile_time_secs": 0.1,  # with a warm cache a third less CPU time than 0.5
+    "jax_compilation_cache_max_size": 2 * 2**30,  # JAX locks a folder with a size limit; processes can then share it
+    "jax_persistent_cache_min_compile_time_secs": 0.1,  # takes a third less CPU time than 0.5 with a warm cache
 }
 COSTLIEST = """
 collect notebooks wheel reference generate run heuristics scripted suite fetch gymnasium_env rl2 docs models trainer
 rollout ppo population_updates oracle hostile faults responses commands controls
 """
-"""The files that take longest, in their order; `test_collect.py` makes what others read."""
+"""Test files that take longest, in the order to run them; `test_collect.py` generates releases that others read."""
 QUICK_COMPILATION = (
-    "--xla_cpu_use_fusion_emitters=false"  # XLA's older code generator takes less time without optimizations
+    "--xla_cpu_use_fusion_emitters=false"  # XLA's older code generator compiles faster if optimizations are off
 )
 
 
 def pytest_configure() -> None:
-    """Compile quickly, and keep compiled programs in a folder for other workers and later runs; also in subprocesses.
+    """Compile quickly and cache compiled programs on disk, for this process, its subprocesses and later runs.
 
     Most tests compile small programs to run them a few times. `JAX_DISABLE_MOST_OPTIMIZATIONS=0 make test` tests
     optimized programs.
@@ -61,9 +61,9 @@ def pytest_configure() -> None:
         jax.config.update("jax_disable_most_optimizations", True)
         if QUICK_COMPILATION in os.environ.get("XLA_FLAGS", "").split() or is_xla_flag(QUICK_COMPILATION):
             os.environ["XLA_FLAGS"] = add_xla_flag(QUICK_COMPILATION)
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")  # bits and tolerances are a CPU's, and workers share no GPU
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")  # tests expect a CPU's bits and tolerances
     jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
-    os.environ.setdefault("PJRT_NPROC", "1")  # what the profiles of the tests choose, before JAX is first used
+    os.environ.setdefault("PJRT_NPROC", "1")  # one thread, as in the test profiles; must be set before JAX starts
     jax.monitoring.register_event_duration_secs_listener(_count_compilation)
     for name, value in COMPILATION_CACHE.items():
         jax.config.update(name, value)
@@ -78,7 +78,7 @@ def _count_compilation(event: str, duration_secs: float, **kwargs: Any) -> None:
 
 
 def _remove_unfinished_entries(folder: Path) -> None:
-    """Remove entries of killed processes, which have no time of access: JAX would fail to add others."""
+    """Remove cache entries that killed processes left without an access-time file; JAX fails to add more otherwise."""
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / ".lockfile"):
         for entry in folder.glob("*-cache"):
@@ -87,13 +87,13 @@ def _remove_unfinished_entries(folder: Path) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the costliest files, so that no worker waits for another one in the end."""
+    """Run the slowest test files first, so that all workers finish at about the same time."""
     order = {f"test_{name}.py": place for place, name in enumerate(COSTLIEST.split())}
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Report a worker's memory and compilations to the main process."""
+    """Report a worker's memory use and number of compilations to the main process."""
     if hasattr(session.config, "workeroutput"):
         peak, now = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024, psutil.Process().memory_info().rss >> 20
         session.config.workeroutput["used"] = (  # type: ignore[attr-defined]
@@ -103,31 +103,31 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node) -> None:
-    """Print the memory and the compilations of a worker."""
+    """Print a worker's memory use and number of compilations."""
     terminal = node.config.pluginmanager.get_plugin("terminalreporter")
     terminal.write_line(f"\n{node.gateway.id}: {getattr(node, 'workeroutput', {}).get('used')}")
 
 
 @pytest.fixture(scope="module", autouse=True)
 def free_compiled_programs() -> Iterator[None]:
-    """Drop the compiled programs once they take much memory; until then other modules use them too."""
+    """Clear the compiled programs after a test module if this process uses much memory."""
     yield
     if psutil.Process().memory_info().rss > MEMORY_TO_FREE:
         jax.clear_caches()
         gc.collect()
-        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)(0)  # glibc keeps freed memory otherwise
+        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)(0)  # without this, glibc keeps freed memory
 
 
 @pytest.fixture(scope="session", autouse=True)
 def temporary_cache(tmp_path_factory) -> None:
-    """Redirect the package's cache, and what it notes and downloads, to folders of this session."""
+    """Redirect the package's cache and downloads to temporary folders of this test session."""
     os.environ["ICRL4AHT_CACHE_DIR"] = str(tmp_path_factory.mktemp("cache"))
     os.environ["ICRL4AHT_DATA_DIR"] = str(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="session")
 def shared_folder(tmp_path_factory) -> SharedFolder:
-    """Return `shared_folder(name, make)`: the folder that the first worker fills by `make(folder)`. Read only."""
+    """Return a function (name, make) that returns a folder; the first worker fills the folder by `make`. Read only."""
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
@@ -145,34 +145,34 @@ def shared_folder(tmp_path_factory) -> SharedFolder:
 
 @pytest.fixture(scope="session")
 def lite(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """A lite release of random play, and the arrays that were written. Read only."""
+    """A lite release of random play, and the arrays written to it by history id. Read only."""
     root = tmp_path_factory.mktemp("releases") / "lite"
     return root, random_release(root, "lite")
 
 
 @pytest.fixture(scope="session")
 def full(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """A full release with the histories of `lite`. Read only."""
+    """A full release with the histories of the fixture `lite`. Read only."""
     root = tmp_path_factory.mktemp("releases") / "full"
     return root, random_release(root, "full")
 
 
 @pytest.fixture(params=["lite", "full"])
 def lite_or_full(request) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """`lite`, then `full`."""
+    """Run a test twice: with the fixture `lite` and with the fixture `full`."""
     return request.getfixturevalue(request.param)
 
 
 @pytest.fixture(scope="session")
 def two_sources(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """A lite release with both sources, splits train and validation and all labels; and its arrays. Read only."""
+    """A lite release with both sources (PPO and noise), two splits and all labels, and its arrays. Read only."""
     root = tmp_path_factory.mktemp("releases") / "two_sources"
     return root, two_source_release(root)
 
 
 @pytest.fixture
 def damaged(lite, tmp_path) -> Path:
-    """A copy of `lite` to damage."""
+    """A copy of the fixture `lite` that a test may damage."""
     root = tmp_path / "release"
     shutil.copytree(lite[0], root)
     return root
@@ -184,7 +184,7 @@ def _generate(profile: Path, out: Path, *options: str) -> None:
 
 @pytest.fixture(scope="session")
 def built(shared_folder) -> Path:
-    """tiny.toml, pair.toml, and `a`: the first, collected and packaged as both kinds by the command. Read only."""
+    """A folder with tiny.toml, pair.toml, and `a`: the lite and full releases generated from tiny.toml. Read only."""
 
     def make(folder: Path) -> None:
         (folder / "tiny.toml").write_text(TINY)
@@ -196,20 +196,20 @@ def built(shared_folder) -> Path:
 
 @pytest.fixture(scope="session")
 def pair(built, shared_folder) -> Path:
-    """pair.toml, collected and packaged by the command. Read only."""
+    """The release that the command `generate` makes from pair.toml. Read only."""
     return shared_folder("pair", lambda folder: _generate(built / "pair.toml", folder))
 
 
 @pytest.fixture(scope="session")
 def published_folder(tmp_path_factory) -> tuple[Path, list[dict[str, np.ndarray]]]:
-    """Hand-written published files. Read only."""
+    """Small files in the published format, written by hand, and their arrays. Read only."""
     folder = tmp_path_factory.mktemp("theirs") / "files"
     return folder, publish(folder)
 
 
 @pytest.fixture(scope="session")
 def converted_release(published_folder, tmp_path_factory) -> Path:
-    """The release of observations converted from `theirs`. Read only."""
+    """The release of observations converted from the fixture `published_folder`. Read only."""
     root = tmp_path_factory.mktemp("ours") / "release"
     assert from_published(published_folder[0], root, kept_steps=KEPT) == "observations"
     return root
@@ -217,7 +217,7 @@ def converted_release(published_folder, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def reconverted_release(lite, tmp_path_factory) -> Path:
-    """`lite` converted to published files without states and back. Read only."""
+    """The fixture `lite` converted to published files without states and back to a release. Read only."""
     folder = tmp_path_factory.mktemp("twin")
     to_published(load_icrl4aht(lite[0]), folder / "files", states=False)
     with h5py.File(folder / "files" / "histories.h5") as file:

@@ -1,4 +1,4 @@
-"""The demo with a tiny model on few histories; the slow test runs it on the bundled release."""
+"""The demo with a tiny model on few histories; the slow test uses the bundled release."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ SETTINGS = demo.DemoSettings(
     seeds=range(4),
 )
 EARNED = {"stay": (0.0, 0.0), "search": (-20.0, 40.0), "oracle": (40.0, 40.0)}
-"""Agent -> returns of the first episode and of the others."""
+"""Returns of each agent: in the first episode, and in each other episode."""
 
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
-    """Return a release of random play with both sources."""
+    """Return a release of random play with histories of the sources search and ppo."""
     root = tmp_path_factory.mktemp("demo") / "release"
     random_release(root, layouts=("demo_wide",), streams=2, length=100, sources=("search", "ppo"))
     return root
 
 
 def evaluation_of(last: float, last_cleared: float):
-    """Return a stand-in of `evaluate` in which a model earns 0, then `last`, less or more by the seed's number."""
+    """Return a replacement of `evaluate`: a model earns 0 in the first episode, then `last` plus the seed."""
 
     def evaluate(agent, make, tasks, protocol, *, seeds, out, details, played, control=None):
         name = agent if control is None else controlled_name(agent, control)
@@ -66,7 +66,7 @@ def evaluation_of(last: float, last_cleared: float):
     ("last", "last_cleared", "verdict"),
     [(20.0, 0.0, "rises by"), (20.0, 20.0, "does not rise by"), (-10.0, -30.0, "does not rise by")],
 )
-def test_verdicts(last, last_cleared, verdict, tmp_path):
+def test_conclusion_says_whether_memory_raises_the_return(last, last_cleared, verdict, tmp_path):
     evaluate = evaluation_of(last, last_cleared)
     for control in (None, "cleared"):
         out = tmp_path / str(control)
@@ -78,8 +78,8 @@ def test_verdicts(last, last_cleared, verdict, tmp_path):
     assert said.startswith(f"Its return {verdict} what it remembers: {last + 1.5:+.1f}")
 
 
-def test_the_demo_runs_every_step(release, tmp_path, monkeypatch):
-    """The model is trained; its evaluation is replaced by invented results."""
+def test_demo_prints_every_step_and_writes_all_files(release, tmp_path, monkeypatch):
+    """The model is really trained, but results of its evaluation are invented."""
     monkeypatch.setattr(results, "evaluate", evaluation_of(20.0, 0.0))
     monkeypatch.setattr(demo, "DEMO_LAYOUT", "demo_wide")
     text = StringIO()
@@ -98,7 +98,7 @@ def test_the_demo_runs_every_step(release, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_complete_demo(tmp_path):
+def test_complete_demo_on_the_bundled_release_shows_plausible_returns(tmp_path):
     text = StringIO()
     short = TrainOptions(steps=2, batch_size=2, context=100)
     demo.run_demo(tmp_path, Console(file=text, width=300), replace(SETTINGS, tasks=None, training=short))

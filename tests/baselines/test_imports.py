@@ -1,4 +1,4 @@
-"""Public imports of the package."""
+"""Names that users import from the package icrl4aht_baselines."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ except ValueError as error:
 """
 
 
-def test_one_line_imports_what_a_user_needs():
-    """Nothing is played, because compiling takes seconds."""
+def test_main_functions_are_imported_from_the_package_without_jax():
+    """The program evaluates nothing, because compiling takes seconds."""
     assert run_python("-c", USE).startswith("unknown protocol 'publishd'; valid: published, ")
 
 
-def test_other_names():
+def test_unknown_name_in_the_package_raises_attribute_error():
     import icrl4aht_baselines
 
     with pytest.raises(AttributeError, match="module 'icrl4aht_baselines' has no attribute 'evalute'"):
         icrl4aht_baselines.evalute  # noqa: B018
 
 
-def test_the_test_tasks_of_a_track():
+def test_test_tasks_can_be_chosen_by_track_layout_and_family():
     from icrl4aht_baselines import test_tasks as tasks_of  # pytest would collect `test_tasks` as a test
 
     sizes = [

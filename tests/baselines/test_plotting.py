@@ -1,4 +1,4 @@
-"""Figures of training and evaluation: few panels, one legend, shared return axes."""
+"""Figures of training logs: few panels, one legend, and shared axes of returns."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def shown(figure):
 
 
 @pytest.mark.parametrize(("layouts", "panels"), [(LAYOUT_NAMES[:6], 7), ((*LAYOUT_NAMES, "a", "b", "c"), 2)])
-def test_a_log_of_many_returns_has_few_panels(layouts, panels, tmp_path, drawn):
+def test_figure_of_a_log_with_many_returns_has_few_panels(layouts, panels, tmp_path, drawn):
     names = [f"return {layout} {kind}" for layout, kind in product(layouts, ("territory", "recipe_aware_button"))]
     lines = [{"step": step, "part": "train", "loss": 1.0} | dict.fromkeys(names, 40.0) for step in range(60)]
     (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))

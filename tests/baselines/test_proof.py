@@ -1,4 +1,4 @@
-"""What a release teaches: jobs that train and evaluate, their stored returns, and the table of the card."""
+"""Models trained on a release to show what they learn: jobs, stored returns, and the table in the release's card."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def release(tmp_path_factory) -> Path:
 
 
 def small_options(root: Path) -> ProofOptions:
-    """Return options of tiny trainings on a release, with one task of each set."""
+    """Return options of tiny trainings on a release, with one validation task of each track."""
     tasks = {track: (bundled_tasks(track, "validation")[0],) for track in ("preference", "teammate")}
     return ProofOptions(str(root), steps=2, batch_size=2, context=20, tasks=tasks)
 
@@ -36,10 +36,10 @@ def returns(first: float, late: float, cleared: float, teammate: float) -> dict[
     return blocks | {"teammate": {"all": teammate}}
 
 
-def test_the_table_has_the_mean_and_range_of_trainings(release, tmp_path):
+def test_proof_table_has_mean_and_range_over_finished_trainings(release, tmp_path):
     options = small_options(release)
     jobs = [ProofJob("all", "ad-expert", seed, options, tmp_path) for seed in (0, 1, 2)]
-    for job, late in zip(jobs[:2], (10.0, 20.0), strict=True):  # the third one is not finished
+    for job, late in zip(jobs[:2], (10.0, 20.0), strict=True):  # the third job stays unfinished
         job.folder.mkdir()
         content = {"settings": job.settings, "minutes": 20.0, "returns": returns(-2.0, late, -1.0, late / 2)}
         job.result_file.write_text(json.dumps(content))
@@ -50,13 +50,13 @@ def test_the_table_has_the_mean_and_range_of_trainings(release, tmp_path):
     path = write_proof(jobs, earned, tmp_path / "proof.json")
     content = json.loads(path.read_text())
     assert content["histories_sha256"] == file_hash(release / HISTORIES)
-    assert content["models"][0]["share"] == [0.25, 0.5]  # gains of 5 and 10 over stay, of the reference's 20
+    assert content["models"][0]["share"] == [0.25, 0.5]  # returns are 5 and 10 above `stay`, that of rl2-reference 20
     spreads = ["-2.0 (-2.0 to -2.0)", "15.0 (10.0 to 20.0)", "-2.0 (-2.0 to -2.0)", "-1.0 (-1.0 to -1.0)"]
     spreads += ["0.38 (0.25 to 0.50)", "20.0 (20.0 to 20.0)"]
     assert " | ".join(["| all | AD, expert labels | 2", *spreads]) in proof_table(content)
 
 
-def test_a_card_shows_the_proof_of_its_own_release(release, tmp_path, monkeypatch):
+def test_card_shows_the_proof_only_of_its_own_release(release, tmp_path, monkeypatch):
     content = {
         "histories_sha256": file_hash(release / HISTORIES),
         "training": {"steps": 800, "batch_size": 16, "context": 500},
@@ -75,7 +75,7 @@ def test_a_card_shows_the_proof_of_its_own_release(release, tmp_path, monkeypatc
 
 
 @pytest.mark.slow
-def test_a_model_is_trained_and_evaluated_with_and_without_memory(release, tmp_path):
+def test_proof_job_trains_and_evaluates_a_model_with_and_without_memory(release, tmp_path):
     options = small_options(release)
     job = ProofJob("all", "dpt-expert", 0, options, tmp_path)
     steps: list[int] = []
@@ -90,4 +90,4 @@ def test_a_model_is_trained_and_evaluated_with_and_without_memory(release, tmp_p
     job.run()
     assert job.result_file.stat().st_mtime_ns == before
     stay = run_references(options, tmp_path)["stay"]["preference"]
-    assert stay["1"] == stay["6-20"]  # it never moves, and its teammate forgets
+    assert stay["1"] == stay["6-20"]  # an ego that never moves earns the same in all episodes

@@ -1,4 +1,4 @@
-"""Reference models: recipes, the steps of building them, and resume."""
+"""Reference models: training recipes, the steps that make the models, and resume."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ TINY = {"steps": 2, "batch_size": 2, "context": 20}
 MODEL = {"layers": 1, "width": 8, "heads": 2, "encoder": "mlp", "teammate_actions": True}
 
 
-def test_recipes_make_the_bundled_models():
-    """Recipes are valid, and equal the settings stored with the bundled models, except paths and newer options."""
+def test_recipes_match_the_settings_of_the_bundled_models():
+    """Each recipe is valid and equals the settings stored with its bundled model."""
     for name, recipe in RECIPES.items():
         get_method(recipe.method)
         ModelOptions(**recipe.model)
@@ -52,7 +52,7 @@ def test_recipes_make_the_bundled_models():
     assert all(noise.end == (0.0, 0.0) and noise.finish[1] < 1 for noise in RL2_HISTORIES.values())
 
 
-def test_unknown_names(tmp_path):
+def test_reference_command_rejects_unknown_names(tmp_path):
     with pytest.raises(
         OptionError, match=r"rl2-reference learns from no histories.*ad-reference, dpt-reference, ad-rising"
     ):
@@ -61,7 +61,7 @@ def test_unknown_names(tmp_path):
     assert "unknown agent" in run_cli(*command, "rl2-referenc", code=2) and not (tmp_path / "out").exists()
 
 
-def test_a_model_is_bundled_with_all_tracks(tmp_path, monkeypatch):
+def test_reference_model_is_bundled_with_all_tracks(tmp_path, monkeypatch):
     copied, cards = [], []
 
     def make(name: str, track: str, *given: Any) -> ReferenceOutcome:
@@ -78,7 +78,7 @@ def test_a_model_is_bundled_with_all_tracks(tmp_path, monkeypatch):
     assert "expected one --name of all tracks" in " ".join(printed.split())
 
 
-def test_cards_show_returns_and_the_training(tmp_path, monkeypatch):
+def test_card_of_a_reference_model_shows_command_and_training_curves(tmp_path, monkeypatch):
     histories = {"root": "x", "layouts": ["demo_wide"], "data_version": "1.0.0", "sizes": {"train": 3}}
     config = {"method": "ad", "model": {}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
     trained = {"config": config, "manifest_sha256": "ab12", "run_hash": "1"}
@@ -103,8 +103,8 @@ def test_cards_show_returns_and_the_training(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def small(monkeypatch, tmp_path) -> Path:
-    """Use recipes that take seconds and a part of the bundled release instead of a rebuilt one."""
+def tiny_recipes(monkeypatch, tmp_path) -> Path:
+    """Use tiny recipes, few tasks, and a part of the bundled release as training data."""
     for name, recipe in RECIPES.items():
         sizes: dict[str, Any] = TINY if recipe.data else {"steps": 1, "batch_size": 8}
         model = MODEL if recipe.data else MODEL | {"recurrent_layers": 1, "dropout": 0.0}
@@ -118,7 +118,7 @@ def small(monkeypatch, tmp_path) -> Path:
         for layout in TRACKS["layout"]["train"]
     ]
     monkeypatch.setattr(reference, "read_tasks", lambda path: few)
-    # Of one family: for each another program is compiled.
+    # Only one family, since each family needs another compiled program.
     histories = load_icrl4aht(layout=list(TRACKS["layout"]["train"]), teammate_family="H1", source="noise")
     (tmp_path / "noise").mkdir()
     to_release(histories, tmp_path / "noise" / "lite", "lite")
@@ -126,17 +126,17 @@ def small(monkeypatch, tmp_path) -> Path:
 
 
 @pytest.mark.slow
-def test_a_model_of_rl2_histories_and_its_own(small):
-    found = reference.make_reference("ad-reference", "layout", small, lambda *shown: None, evaluates=False)
-    assert found.run == small / "ad-reference-layout" and found.results == {}
-    made = {path.name for path in small.iterdir() if path.is_dir() and not path.name.startswith(".")}
+def test_reference_model_trains_on_rl2_histories_then_on_its_own_histories(tiny_recipes):
+    found = reference.make_reference("ad-reference", "layout", tiny_recipes, lambda *shown: None, evaluates=False)
+    assert found.run == tiny_recipes / "ad-reference-layout" and found.results == {}
+    made = {path.name for path in tiny_recipes.iterdir() if path.is_dir() and not path.name.startswith(".")}
     own_round = {f"ad-reference-layout{end}" for end in ("", "-first", "-own", "-mixed")}
     assert made == {"noise", "rl2-reference-layout", "agent-layout", *own_round}
     trained = read_trained(found.run)
     assert trained.hide_recipe == ("asymm_both",) and trained.step == 2
     assert {cell["source"] for cell in trained.trained_on} == {"agent"}
-    own, mixed = (load_icrl4aht(small / f"ad-reference-layout-{name}") for name in ("own", "mixed"))
-    assert len(mixed) == len(own) + len(load_icrl4aht(small / "agent-layout"))
-    times = {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")}
-    reference.make_reference("ad-reference", "layout", small, lambda *shown: None, evaluates=False)
-    assert {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")} == times
+    own, mixed = (load_icrl4aht(tiny_recipes / f"ad-reference-layout-{name}") for name in ("own", "mixed"))
+    assert len(mixed) == len(own) + len(load_icrl4aht(tiny_recipes / "agent-layout"))
+    times = {path: path.stat().st_mtime_ns for path in tiny_recipes.rglob("*.safetensors")}
+    reference.make_reference("ad-reference", "layout", tiny_recipes, lambda *shown: None, evaluates=False)
+    assert {path: path.stat().st_mtime_ns for path in tiny_recipes.rglob("*.safetensors")} == times

@@ -1,4 +1,4 @@
-"""The GPU benchmark: tiny sizes run on a CPU, and full-size programs lower for CUDA."""
+"""The GPU benchmark: tiny sizes run on a CPU, and programs of full size are lowered for CUDA."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ MEASURED = {
     "act": {"steps_per_second", "streams"},
     "attention": {"models_milliseconds"},
 }
-"""Part -> some keys of its lines."""
+"""Keys that each benchmark case must print, by part of the benchmark."""
 
 
 def lines_of(output: str) -> dict[str, dict[str, Any]]:
@@ -52,8 +52,8 @@ def lines_of(output: str) -> dict[str, dict[str, Any]]:
 
 
 @pytest.mark.slow
-def test_the_command():
-    """One case of each part."""
+def test_gpu_benchmark_prints_expected_keys_of_each_case():
+    """Run one case of each part of the benchmark."""
     cases = ["device", "product", "learner/mlp", "act/tiny", "loader/tiny", "train/tiny/mlp/bfloat16", "attention"]
     assert {case.split("/")[0] for case in cases} == set(PARTS)
     options = [word for case in cases for word in ("--case", case)]
@@ -66,13 +66,13 @@ def test_the_command():
     assert found["learner/mlp"]["mfu"] > 0
 
 
-def test_cases_without_time_are_reported_as_skipped():
+def test_cases_after_the_time_limit_are_reported_as_skipped():
     found = lines_of(run_cli("--minutes 0", program=bench_gpu.main))
     assert found.keys() == CASES.keys()
     assert all(line["skipped"] for line in found.values())
 
 
-def test_an_error_is_reported_and_ends_the_process(monkeypatch):
+def test_error_of_a_case_is_reported_and_ends_the_process(monkeypatch):
     monkeypatch.setitem(CASES, "product", lambda sizes: 1 / 0)
     printed = run_cli("--here --part product --part loader", code=1, program=bench_gpu.main)
     assert lines_of(printed) == {
@@ -80,7 +80,7 @@ def test_an_error_is_reported_and_ends_the_process(monkeypatch):
     }
 
 
-def test_a_batch_that_does_not_fit_is_computed_in_parts(monkeypatch):
+def test_batch_that_does_not_fit_in_memory_is_split(monkeypatch):
     tried = []
 
     def steps(sizes, size, encoder, dtype, parts):
@@ -94,13 +94,13 @@ def test_a_batch_that_does_not_fit_is_computed_in_parts(monkeypatch):
     assert measure(FULL_SIZES) == {"accumulate": 4}
     assert tried == [1, 2, 4]
     with pytest.raises(MemoryError, match="no number of parts fits: RESOURCE_EXHAUSTED"):
-        measure(SMALL_SIZES)  # of 2 rows
+        measure(SMALL_SIZES)  # a batch of 2 rows has at most 2 parts
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("encoder", ["paper", "words", "mlp"])
-def test_learners_lower_for_cuda(encoder):
-    """In the sizes that the benchmark has on a GPU; nothing is compiled."""
+def test_updates_of_ego_learners_can_be_lowered_for_cuda(encoder):
+    """Programs with the sizes that the benchmark uses on a GPU are lowered, but not compiled."""
     learner = ego_learner(FULL_SIZES, encoder)
     update: Any = compiled_update(learner)
     traced = update.trace(jax.eval_shape(learner.init, jax.random.key(0)))
@@ -110,8 +110,8 @@ def test_learners_lower_for_cuda(encoder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["small/paper/bfloat16", "small/words/float32", "tiny/mlp/bfloat16"])
-def test_training_steps_lower_for_cuda(case):
-    """In the sizes that the benchmark has on a GPU; nothing is compiled."""
+def test_training_steps_of_models_can_be_lowered_for_cuda(case):
+    """Programs with the sizes that the benchmark uses on a GPU are lowered, but not compiled."""
     size, encoder, dtype = case.split("/")
     dataset, length = load_icrl4aht(layout="demo_wide", obs="state"), context_length(FULL_SIZES, size)
     method = ad_method(architecture(FULL_SIZES, size, encoder, dtype), dataset.layouts)  # type: ignore[arg-type]
@@ -126,7 +126,7 @@ def test_training_steps_lower_for_cuda(case):
     assert product_flops(traced.jaxpr) > 1e5 * FULL_SIZES.batch * length
 
 
-def test_acting_lowers_for_cuda():
+def test_evaluation_episode_can_be_lowered_for_cuda():
     tasks = h4_tasks()[:2]
     method = ad_method(architecture(SMALL_SIZES, "tiny", "mlp", "float32"), [tasks[0].layout])
     params = jax.eval_shape(method.init, jax.random.key(0))

@@ -1,4 +1,4 @@
-"""Benchmark cases in processes that crash, fail, print or hang."""
+"""Benchmark cases that run in child processes, which may crash, fail, print text or hang."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ for case in sys.argv[1:]:
 
 
 def run(*cases: str, seconds: float = 30, case_seconds: float = 20) -> tuple[int, dict]:
-    """Run cases; return the number of failures and the facts of each case in order."""
+    """Run benchmark cases; return the number of failures and the printed facts of each case."""
     found = {}
 
     def note(case, facts):
@@ -41,7 +41,7 @@ def run(*cases: str, seconds: float = 30, case_seconds: float = 20) -> tuple[int
     return failures, found
 
 
-def test_cases_share_a_process_until_one_fails():
+def test_benchmark_cases_share_a_process_until_a_case_fails():
     failures, found = run("one", "two", "fail", "three", "crash", "four")
     assert failures == 2
     assert found["one"] == found["two"]
@@ -50,7 +50,7 @@ def test_cases_share_a_process_until_one_fails():
     assert len({found[case]["process"] for case in ("one", "three", "four")}) == 3
 
 
-def test_a_case_that_hangs_is_stopped_and_the_next_one_runs():
+def test_hanging_benchmark_case_is_stopped_and_the_next_case_runs():
     failures, found = run("one", "hang", "two", case_seconds=1)
     assert failures == 1
     assert found["hang"] == {"error": "stopped after 1 s"}

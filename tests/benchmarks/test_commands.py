@@ -1,4 +1,4 @@
-"""The benchmarks at the smallest scale: they run and print consistent numbers."""
+"""The benchmark commands at the smallest scale run and print consistent numbers."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from tests.helpers.commands import run_cli
 
 
 def run(module: Any, options: str) -> list[dict[str, Any]]:
-    """Run a benchmark and return its JSON lines."""
+    """Run a benchmark's command and return the JSON lines that it prints."""
     printed = run_cli(options, program=module.main)
     return [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
 
 
 def check_ratio(line: dict[str, Any], peer: str) -> None:
-    """Check the ratio of one round."""
+    """Check the speed ratio to another implementation in a benchmark of one round."""
     assert line["ratio_min"] == line["ratio"] == line["ratio_max"]
     assert line["ratio"] == pytest.approx(line["steps_per_second"] / line[f"{peer}_steps_per_second"], rel=2e-3)
 
 
 @pytest.mark.slow
-def test_collection(built, tmp_path, monkeypatch):
-    """Sizes are measured on the histories of one layout."""
+def test_collection_benchmark_measures_speed_and_size(built, tmp_path, monkeypatch):
+    """The stored sizes are measured on the histories of one layout."""
     root = to_release(load_icrl4aht(layout="demo_wide"), tmp_path / "part", "lite")
     monkeypatch.setattr(bench_collect, "load_icrl4aht", partial(load_icrl4aht, root))
     speed, size = run(bench_collect, f"speed bytes --profile {built / 'tiny.toml'} --updates 3 --streams 1")
@@ -43,7 +43,7 @@ def test_collection(built, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_environments(monkeypatch):
+def test_environment_benchmark_compares_with_jaxmarl(monkeypatch):
     monkeypatch.setattr(bench_env, "STEPS", 8)
     lines = run(bench_env, "--layout cramped_up --environments 2 --rounds 1")
     assert [line["part"] for line in lines] == ["layouts", "steps", "steps", "steps"]
@@ -74,9 +74,9 @@ def main(config):
 
 
 @pytest.mark.slow
-def test_the_jaxmarl_script_gets_both_environments(tmp_path, monkeypatch):
-    """A small script replaces the one of `--peer`, which JaxMARL's package does not contain."""
-    monkeypatch.setattr("jaxmarl.make", None)  # restored after the test
+def test_jaxmarl_script_is_run_with_both_environments(tmp_path, monkeypatch):
+    """A small script replaces JaxMARL's training script, which JaxMARL's package does not contain."""
+    monkeypatch.setattr("jaxmarl.make", None)  # so that monkeypatch restores it after the test
     script = tmp_path / "ippo.py"
     script.write_text(SCRIPT)
     options = ["--layout", "cramped_up", "--environments", "2", "--rollout", "4", "--rounds", "1", "--peer", script]
@@ -87,7 +87,7 @@ def test_the_jaxmarl_script_gets_both_environments(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_readers(tmp_path):
+def test_reading_benchmark_compares_with_other_readers(tmp_path):
     options = "--histories 2 --batch 3 --length 100 --rounds 1 --threads 1"
     read = run(bench_loader, f"--folder {tmp_path} {options}")
     assert len(read) == 2 * (4 + 3 + 3)
@@ -96,7 +96,7 @@ def test_readers(tmp_path):
     assert {line["least_ratio"] for line in read if "least_ratio" in line} == {8000, 400, 200, None}
 
 
-def test_the_reader_of_the_published_format_makes_the_same_windows(lite, tmp_path):
+def test_reader_of_the_published_format_gives_the_same_windows(lite, tmp_path):
     dataset = load_icrl4aht(lite[0], layout="demo_wide")
     to_published(dataset, tmp_path / "published", states=False)
     sampler = dataset.ad(batch_size=8, length=100, seed=3)
@@ -127,7 +127,7 @@ presets = ["default"]
 
 
 @pytest.mark.slow
-def test_egos_of_profiles(tmp_path):
+def test_learning_benchmark_compares_ego_profiles(tmp_path):
     options = "--part ego --layout cramped_up --rounds 1"
     for encoder in ("paper", "mlp"):
         path = tmp_path / f"{encoder}.toml"
@@ -140,7 +140,7 @@ def test_egos_of_profiles(tmp_path):
 
 
 @pytest.mark.slow
-def test_sequence_models(monkeypatch):
+def test_learning_benchmark_measures_sequence_models(monkeypatch):
     monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 8, 5, heads=2, context=6, encoder="mlp"))
     tasks = [task for task in published_tasks("teammate") if task.layout.name == "demo_wide"][:1]
     monkeypatch.setattr(bench_learn, "published_tasks", lambda track: tasks)
@@ -151,5 +151,5 @@ def test_sequence_models(monkeypatch):
     assert (all_tasks["tasks"], all_tasks["episodes"]) == (2, 1)
 
 
-def test_the_peer_needs_its_file():
+def test_jaxmarl_benchmark_without_script_file_fails():
     assert "--peer FILE" in run_cli("--part jaxmarl", code=2, program=bench_learn.main)

@@ -1,4 +1,4 @@
-"""The JAX environment, and the rules and observations in JAX compared with NumPy."""
+"""The JAX environment: starts, episodes, keys and recipes, and equality of rules in JAX and NumPy."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from icrl4aht_data.overcooked.state import State, columns, unpack
 from tests.helpers.states import random_records, state_record
 
 CRAMPED = LAYOUTS["cramped_up"]
-PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece of ingredient 0 and of ingredient 1
+PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are one piece of ingredient 0 and 1
 FOUR_RECIPES = np.array([3 * ZERO, 2 * ZERO + ONE, ZERO + 2 * ONE, 3 * ONE], np.uint8)
 
-N, MAX_STEPS, STEPS = 2000, 5, 13  # every test steps the same two batches: 2,000 environments and one
+N, MAX_STEPS, STEPS = 2000, 5, 13  # N environments in one batch
 
 DEFAULT_LAYOUTS = ("coord_ring", "demo_wide", "asymm_right")
-"""Three contrasting layouts; tests of the others are slow."""
+"""Three different layouts; tests of other layouts are marked slow."""
 
-FLOOR = {  # the rooms' floor cells (x, y), ego's and teammate's, read off the maps
+FLOOR = {  # floor cells (x, y) that the ego and the teammate can reach, read off the maps
     "cramped_up": ([(x, y) for y in (1, 2) for x in (1, 2, 3)],) * 2,
     "asymm_both": (
         [(1, 1), (1, 2), (2, 2), (3, 2), (1, 3), (2, 3), (3, 3)],
@@ -41,7 +41,7 @@ FLOOR = {  # the rooms' floor cells (x, y), ego's and teammate's, read off the m
 
 
 class Compiled(NamedTuple):
-    """An environment with its two functions, each jitted once."""
+    """An environment with its functions `init` and `step`, each jitted once."""
 
     env: Environment
     init: jax.stages.Wrapped
@@ -61,8 +61,8 @@ def some_keys(number: int) -> jax.Array:
     return jax.random.split(jax.random.key(number), N)
 
 
-def at_goal(state: EnvState) -> EnvState:
-    """Return environments of cramped_up changed: the teammate is at the goal with the dish of the current recipe."""
+def move_to_goal(state: EnvState) -> EnvState:
+    """Change environments on cramped_up: the teammate faces the goal with a dish of the current recipe."""
     where, recipes = columns(CRAMPED), fields(CRAMPED, state.record).recipe
     records = np.repeat(state_record(CRAMPED, (1, 1, "up"), (3, 2, "down")), len(recipes), axis=0)
     records[:, where.recipe] = recipes
@@ -70,26 +70,26 @@ def at_goal(state: EnvState) -> EnvState:
     return state._replace(record=jnp.asarray(records))
 
 
-class Life(NamedTuple):
-    """Steps of a batch: the state before each, its result, and the actions."""
+class StepBatch(NamedTuple):
+    """Steps of a batch of environments: states before each step, results and actions."""
 
     before: list[EnvState]
     steps: list
-    actions: np.ndarray  # (STEPS, N, 2)
+    actions: np.ndarray  # shape (STEPS, N, 2)
 
 
-def live(compiled: Compiled, keys: jax.Array, actions: np.ndarray) -> Life:
-    """Return steps from the first episode into the third; in the second step of each, every teammate delivers."""
+def step_batch(compiled: Compiled, keys: jax.Array, actions: np.ndarray) -> StepBatch:
+    """Step through two episodes into a third; in the second step of each episode, every teammate delivers."""
     state, before, steps = compiled.init(keys), [], []
     actions = actions.copy()
     for number in range(len(actions)):
         if number % MAX_STEPS == 1:
-            state = at_goal(state)
+            state = move_to_goal(state)
             actions[number] = STAY, INTERACT
         before.append(state)
         steps.append(compiled.step(state, jnp.asarray(actions[number])))
         state = steps[-1].state
-    return Life(before, steps, actions)
+    return StepBatch(before, steps, actions)
 
 
 @pytest.fixture(scope="module")
@@ -103,8 +103,8 @@ def actions() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def life(cramped, keys, actions) -> Life:
-    return live(cramped, keys, actions)
+def batch_steps(cramped, keys, actions) -> StepBatch:
+    return step_batch(cramped, keys, actions)
 
 
 def fields(layout: Layout, record: jax.Array) -> State:
@@ -112,7 +112,7 @@ def fields(layout: Layout, record: jax.Array) -> State:
 
 
 def assert_uniform(values: Sequence | np.ndarray, possible: int) -> None:
-    """Every one of `possible` values occurs equally often: chi-square within six standard deviations of its mean."""
+    """Assert that `possible` values occur equally often: chi-square is below six standard deviations above its mean."""
     found, counts = np.unique(np.asarray(values), axis=0, return_counts=True)
     assert len(found) == possible
     expected = counts.sum() / possible
@@ -121,11 +121,8 @@ def assert_uniform(values: Sequence | np.ndarray, possible: int) -> None:
     assert ((counts - expected) ** 2 / expected).sum() < freedom + 6 * np.sqrt(2 * freedom)
 
 
-# Starts
-
-
 @pytest.mark.parametrize("name", FLOOR)
-def test_starts_are_uniform_over_the_rooms_and_facings_and_recipes(name):
+def test_start_positions_facings_and_recipes_are_uniform(name):
     layout = LAYOUTS[name]
     init = jax.jit(Environment(layout).init)
     states = [init(some_keys(number)) for number in range(3)]
@@ -139,29 +136,26 @@ def test_starts_are_uniform_over_the_rooms_and_facings_and_recipes(name):
         assert_uniform(state.positions[:, agent], len(room))
         assert_uniform(np.stack([state.positions[:, agent], state.facings[:, agent]], axis=1), 4 * len(room))
         assert_uniform(np.stack([state.positions[:, agent], state.recipe], axis=1), 2 * len(room))
-    assert_uniform(state.positions, pairs)  # the two never share a cell
+    assert_uniform(state.positions, pairs)  # the agents never share a cell
     assert_uniform(np.concatenate([state.facings, state.recipe[:, None]], axis=1), 4 * 4 * 2)
     assert set(np.unique(state.recipe)) == {3 * ZERO, 3 * ONE}
     assert not records[:, columns(layout).hands].any()
     assert not records[:, columns(layout).delivered :].any()
 
 
-# Episodes
-
-
-def test_done_comes_exactly_after_max_steps(life):
-    done = np.stack([np.asarray(step.done) for step in life.steps])
+def test_episodes_end_exactly_after_max_steps(batch_steps):
+    done = np.stack([np.asarray(step.done) for step in batch_steps.steps])
     ends = [False, False, False, False, True]
     np.testing.assert_array_equal(done, np.array([*ends, *ends, *ends[:3]])[:, None].repeat(N, axis=1))
-    clocks = np.stack([np.asarray(step.state.clock) for step in life.steps])
-    episodes = np.stack([np.asarray(step.state.episode) for step in life.steps])
+    clocks = np.stack([np.asarray(step.state.clock) for step in batch_steps.steps])
+    episodes = np.stack([np.asarray(step.state.episode) for step in batch_steps.steps])
     assert (clocks == np.array([1, 2, 3, 4, 0, 1, 2, 3, 4, 0, 1, 2, 3])[:, None]).all()
     assert (episodes == np.array([0] * 4 + [1] * 5 + [2] * 4)[:, None]).all()
 
 
-def test_final_is_the_rules_outcome_and_is_never_reset(life):
-    for state, step, actions in zip(life.before, life.steps, life.actions, strict=True):
-        recipes = np.asarray(step.final)[:, columns(CRAMPED).recipe]  # the draws; judged below
+def test_final_state_follows_the_rules_even_if_the_episode_ends(batch_steps):
+    for state, step, actions in zip(batch_steps.before, batch_steps.steps, batch_steps.actions, strict=True):
+        recipes = np.asarray(step.final)[:, columns(CRAMPED).recipe]  # the drawn recipes
         expected = rules.step(CRAMPED, np.asarray(state.record), actions, recipes)
         np.testing.assert_array_equal(step.final, expected.state)
         np.testing.assert_array_equal(step.reward, expected.reward)
@@ -170,26 +164,23 @@ def test_final_is_the_rules_outcome_and_is_never_reset(life):
             np.testing.assert_array_equal(step.state.record, step.final)
 
 
-def test_only_finished_environments_restart(cramped, life):
-    """Environments with different clocks in one batch restart separately."""
+def test_only_environments_with_ended_episodes_restart(cramped, batch_steps):
+    """Environments in one batch restart when their own episode ends."""
     clocks = np.arange(N) % MAX_STEPS
-    state = life.steps[2].state._replace(clock=jnp.asarray(clocks, jnp.int32))
-    step = cramped.step(state, jnp.asarray(life.actions[3]))
+    state = batch_steps.steps[2].state._replace(clock=jnp.asarray(clocks, jnp.int32))
+    step = cramped.step(state, jnp.asarray(batch_steps.actions[3]))
     done = clocks == MAX_STEPS - 1
     np.testing.assert_array_equal(step.done, done)
     np.testing.assert_array_equal(step.state.clock, np.where(done, 0, clocks + 1))
     np.testing.assert_array_equal(step.state.episode, done)
     np.testing.assert_array_equal(np.asarray(step.state.record)[~done], np.asarray(step.final)[~done])
-    # Auto-reset leads to the start of the second episode, whenever it comes.
+    # The start of the second episode does not depend on when the first one ends.
     np.testing.assert_array_equal(
-        np.asarray(step.state.record)[done], np.asarray(life.steps[MAX_STEPS - 1].state.record)[done]
+        np.asarray(step.state.record)[done], np.asarray(batch_steps.steps[MAX_STEPS - 1].state.record)[done]
     )
 
 
-# Keys
-
-
-def assert_equal_lives(found: Sequence, expected: Sequence, which: slice) -> None:
+def assert_equal_steps(found: Sequence, expected: Sequence, which: slice) -> None:
     for ours, theirs in zip(found, expected, strict=True):
         np.testing.assert_array_equal(ours.final, np.asarray(theirs.final)[which])
         np.testing.assert_array_equal(ours.state.record, np.asarray(theirs.state.record)[which])
@@ -199,33 +190,30 @@ def assert_equal_lives(found: Sequence, expected: Sequence, which: slice) -> Non
 
 
 @pytest.mark.parametrize("number", [0, 1234])
-def test_an_environment_alone_equals_one_in_a_batch(cramped, keys, actions, life, number):
+def test_single_environment_equals_an_environment_in_a_batch(cramped, keys, actions, batch_steps, number):
     which = slice(number, number + 1)
-    alone = live(cramped, keys[which], actions[:, which])
-    assert_equal_lives(alone.steps, life.steps, which)
+    alone = step_batch(cramped, keys[which], actions[:, which])
+    assert_equal_steps(alone.steps, batch_steps.steps, which)
 
 
-def test_the_position_in_the_batch_and_the_others_do_not_matter(cramped, keys, actions, life):
+def test_environment_does_not_depend_on_position_or_others_in_batch(cramped, keys, actions, batch_steps):
     others = some_keys(2)
     mixed = jnp.concatenate([others[: N // 2], keys[: N // 2][::-1]])
     theirs = np.concatenate([actions[:, N // 2 :], actions[:, : N // 2][:, ::-1]], axis=1)
-    found = live(cramped, mixed, theirs)
+    found = step_batch(cramped, mixed, theirs)
     mine = [jax.tree.map(lambda leaf: leaf[N // 2 :][::-1], step) for step in found.steps]
-    assert_equal_lives(mine, life.steps, slice(0, N // 2))
+    assert_equal_steps(mine, batch_steps.steps, slice(0, N // 2))
 
 
-def test_raw_keys_are_the_same_as_typed_ones(cramped, keys):
+def test_raw_random_keys_give_results_of_typed_keys(cramped, keys):
     np.testing.assert_array_equal(cramped.init(jax.random.key_data(keys)).record, cramped.init(keys).record)
 
 
-# Recipes
-
-
 def transitions(compiled: Compiled, seed: int, deliveries: int) -> np.ndarray:
-    """(deliveries * N, 2): the recipe before and after each of several correct deliveries, one a step."""
+    """Deliver in every step; return recipes before and after each correct delivery, shape (deliveries * N, 2)."""
     state, pairs = compiled.init(some_keys(seed)), []
     for _ in range(deliveries):
-        state = at_goal(state)
+        state = move_to_goal(state)
         step = compiled.step(state, jnp.asarray(np.tile(np.array([STAY, INTERACT], np.int32), (N, 1))))
         assert (np.asarray(step.reward) == 20).all()
         assert (fields(CRAMPED, step.final).delivered == 1).all()
@@ -235,16 +223,16 @@ def transitions(compiled: Compiled, seed: int, deliveries: int) -> np.ndarray:
     return np.concatenate([np.stack(pair, axis=1) for pair in pairs])
 
 
-def test_a_correct_delivery_draws_a_recipe_that_may_repeat(cramped):
+def test_correct_delivery_draws_a_uniform_next_recipe(cramped):
     pairs = transitions(cramped, seed=3, deliveries=4)
     assert set(np.unique(pairs)) == {3 * ZERO, 3 * ONE}
-    assert_uniform(pairs, 4)  # also the pairs of equal ones
+    assert_uniform(pairs, 4)  # the next recipe may equal the previous one
     by_environment = pairs[:, 1].reshape(4, N).T
-    assert_uniform(by_environment, 16)  # nor does one draw follow from another
+    assert_uniform(by_environment, 16)  # successive recipes are independent
 
 
-def test_without_a_correct_delivery_the_recipe_stays(life):
-    for number, (state, step) in enumerate(zip(life.before, life.steps, strict=True)):
+def test_recipe_changes_only_after_correct_deliveries(batch_steps):
+    for number, (state, step) in enumerate(zip(batch_steps.before, batch_steps.steps, strict=True)):
         before, after = (fields(CRAMPED, record) for record in (state.record, step.final))
         correct = number % MAX_STEPS == 1
         assert (after.delivered == correct).all()
@@ -252,19 +240,16 @@ def test_without_a_correct_delivery_the_recipe_stays(life):
         assert 0.4 < changed < 0.6 if correct else changed == 0
 
 
-def test_recipes_of_ones_own_are_drawn_at_the_start_and_after_deliveries():
+def test_custom_recipes_are_drawn_at_starts_and_after_deliveries():
     four = Compiled.of(Environment(CRAMPED, max_steps=MAX_STEPS, recipes=FOUR_RECIPES))
     np.testing.assert_array_equal(four.env.recipe_items, FOUR_RECIPES)
     np.testing.assert_array_equal(Environment(CRAMPED).recipe_items, [3 * ZERO, 3 * ONE])
     started = fields(CRAMPED, four.init(some_keys(4)).record).recipe
     assert set(np.unique(started)) == set(FOUR_RECIPES.tolist())
     assert_uniform(started, 4)
-    pairs = transitions(four, seed=4, deliveries=MAX_STEPS)  # the last one ends the episode, final shows it still
+    pairs = transitions(four, seed=4, deliveries=MAX_STEPS)  # the last delivery ends the episode
     assert set(np.unique(pairs)) == set(FOUR_RECIPES.tolist())
     assert_uniform(pairs, 16)
-
-
-# The rules and observations in JAX compared with NumPy
 
 
 @pytest.fixture(
@@ -274,14 +259,14 @@ def test_recipes_of_ones_own_are_drawn_at_the_start_and_after_deliveries():
         for name, layout in LAYOUTS.items()
     ],
 )
-def in_jax(request: pytest.FixtureRequest):
-    """Return a layout, and one jitted step with the observations of the state before it."""
+def jitted_rules(request: pytest.FixtureRequest):
+    """Return a layout, and a jitted function that steps the rules and observes the state before the step."""
     layout = request.param
     return layout, jax.jit(lambda *inputs: (*rules.step(layout, *inputs), observe_both(layout, inputs[0])))
 
 
 def random_inputs(layout: Layout, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Records, actions and next recipes; mostly interactions, and the first pot's soup is often the recipe's."""
+    """Return random records, actions (mostly `interact`) and next recipes; soups often match the recipe."""
     rng = np.random.default_rng(size)
     records, where = random_records(layout, size, rng), columns(layout)
     soup = records[:, where.pot_items.start]
@@ -296,8 +281,8 @@ def assert_same_bytes(found: Sequence, expected: Sequence) -> None:
         np.testing.assert_array_equal(np.asarray(ours), np.asarray(theirs))
 
 
-def test_numpy_and_jax_give_equal_bytes(in_jax):
-    layout, jitted = in_jax
+def test_rules_and_observations_are_equal_in_numpy_and_jax(jitted_rules):
+    layout, jitted = jitted_rules
     inputs = random_inputs(layout, 3072)
     outcome = rules.step(layout, *inputs)
     ours = (*outcome, observe_both(layout, inputs[0]))
@@ -305,4 +290,4 @@ def test_numpy_and_jax_give_equal_bytes(in_jax):
     deep_inputs = [array.reshape(64, 48, *array.shape[1:]) for array in inputs]
     assert_same_bytes(jitted(*deep_inputs), [array.reshape(64, 48, *array.shape[1:]) for array in ours])
     everything = 255 if layout.buttons else 255 & ~rules.PRESSED
-    assert np.bitwise_or.reduce(outcome.events, axis=None) == everything  # the states cover every event
+    assert np.bitwise_or.reduce(outcome.events, axis=None) == everything  # every event occurs

@@ -1,4 +1,4 @@
-"""Environments of several layouts: every one plays as it does alone."""
+"""Environments with several layouts in one batch play like environments with a single layout."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from icrl4aht_data.overcooked.state import columns, padded_positions
 from icrl4aht_data.overcooked.tables import make_tables, stack_tables
 
 NAMES = ("cramped_up", "coord_ring", "test_wide", "demo_wide")
-"""Layouts of different sizes, with one room and with two, with buttons and with delivery indicators."""
+"""Layouts of different sizes; in some, agents are separated, or buttons or delivery indicators exist."""
 
 GROUP = [LAYOUTS[name] for name in NAMES]
 ENVS, STEPS = 3 * len(NAMES), 30
@@ -25,12 +25,12 @@ ENVS, STEPS = 3 * len(NAMES), 30
 
 @pytest.fixture(scope="module")
 def played() -> dict[str, np.ndarray]:
-    """Two episodes of random actions: arrays (steps, environments, ...)."""
+    """Play two episodes of random actions; return arrays (steps, environments, ...) by name."""
     env = Environment(GROUP, max_steps=STEPS)
 
     def step(state, key):
         actions = jax.random.randint(key, (ENVS, 2), 0, 6)
-        actions = jnp.where(jax.random.uniform(key, actions.shape) < 0.4, 5, actions)  # more interaction than walking
+        actions = jnp.where(jax.random.uniform(key, actions.shape) < 0.4, 5, actions)  # interacts more often
         after = env.step(state, actions)
         shown = {
             "record": state.record,
@@ -54,14 +54,14 @@ def keys_of(count: int) -> jax.Array:
 
 
 @pytest.mark.parametrize("number", range(len(NAMES)), ids=NAMES)
-def test_every_layout_plays_as_alone(played, number):
+def test_layout_in_a_group_plays_like_a_single_layout(played, number):
     layout, envs = GROUP[number], np.arange(number, ENVS, len(NAMES))
     own = padded_positions(layout, stack_tables(GROUP))
     part = {name: value[:, envs] for name, value in played.items()}
     assert (part["layout"] == number).all()
     records, final = part["record"][..., own], part["final"][..., own]
     others = np.setdiff1d(np.arange(part["record"].shape[-1]), own)
-    assert not part["record"][..., others].any()  # nothing is ever in a padded pot or on a padded counter
+    assert not part["record"][..., others].any()  # padded pots and counters stay empty
     for episode in (0, STEPS):
         start = Environment(layout, STEPS).first_record(keys_of(ENVS)[envs], jnp.full(len(envs), episode // STEPS))
         np.testing.assert_array_equal(records[episode], start)
@@ -74,7 +74,7 @@ def test_every_layout_plays_as_alone(played, number):
     assert (records[..., columns(layout).hands] > 0).any()
 
 
-def test_layouts_are_drawn_at_each_reset():
+def test_layouts_are_drawn_uniformly_at_each_reset():
     env = Environment(GROUP, max_steps=1, redraws=True)
     step = jax.jit(lambda state: env.step(state, jnp.full((ENVS, 2), 4)).state)
     states = [jax.jit(env.init)(keys_of(ENVS))]
@@ -89,7 +89,7 @@ def test_layouts_are_drawn_at_each_reset():
 
 
 class TestTables:
-    def test_padding_of_a_layout_changes_nothing_that_is_its_own(self):
+    def test_padding_does_not_change_the_tables_of_a_layout(self):
         stacked = stack_tables(GROUP)
         for number, layout in enumerate(GROUP):
             own = make_tables(layout, stacked.pots.shape[-1], stacked.buttons.shape[-1])
@@ -97,7 +97,7 @@ class TestTables:
                 np.testing.assert_array_equal(padded[number][tuple(map(slice, table.shape))], table)
                 assert padded.dtype == table.dtype
 
-    def test_padded_cells_are_walls_that_nobody_faces(self):
+    def test_padded_cells_are_walls_that_agents_cannot_face(self):
         stacked = stack_tables(GROUP)
         for number, layout in enumerate(GROUP):
             beyond = slice(layout.cells, None)
@@ -106,11 +106,11 @@ class TestTables:
             for kind, cells in ((POT, layout.pots), (BUTTON, layout.buttons), (WALL, layout.counters)):
                 assert set((faced[faced & 255 == kind] >> 16).tolist()) <= set(range(len(cells)))
 
-    def test_without_layouts(self):
+    def test_stacking_no_layouts_raises_error(self):
         with pytest.raises(OptionError, match="no layouts to stack"):
             stack_tables([])
 
-    def test_channels_that_only_some_layouts_have(self):
+    def test_layout_without_canonical_channels_raises_error(self):
         odd = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),))
         with pytest.raises(OptionError, match=r"layouts \['mine'\] have ingredients without a canonical channel"):
             stack_tables([odd, *GROUP])
@@ -118,7 +118,7 @@ class TestTables:
             observe_both(odd, np.zeros((1, 8 + len(odd.counters)), np.uint8), canonical=True)
 
 
-def test_numbers_of_layouts_can_be_chosen():
+def test_initial_layouts_can_be_chosen_by_number():
     env = Environment(GROUP, max_steps=STEPS)
     state = jax.jit(env.init)(keys_of(2), jnp.array([3, 1]))
     assert state.layout is not None and state.layout.tolist() == [3, 1]

@@ -1,4 +1,4 @@
-"""Lookup tables of shortest paths, compared with brute force."""
+"""Tables of shortest paths, compared with brute-force search."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ DELTA = {UP: (0, -1), DOWN: (0, 1), LEFT: (-1, 0), RIGHT: (1, 0)}
 
 
 def neighbour(layout: Layout, cell: int, action: int) -> int:
-    """Return the cell next to a cell, -1 outside the map."""
+    """Return the adjacent cell in the direction of an action, or -1 outside the map."""
     x, y = cell % layout.width + DELTA[action][0], cell // layout.width + DELTA[action][1]
     return y * layout.width + x if 0 <= x < layout.width and 0 <= y < layout.height else -1
 
 
 def brute_move(layout: Layout, cell: int, action: int) -> int:
-    """Return the cell to which a move leads when no agent is in the way."""
+    """Return the cell to which a move leads if no other agent is in the way."""
     target = neighbour(layout, cell, action)
     return target if target >= 0 and "".join(layout.rows)[target] in " A" else cell
 
 
 @lru_cache
 def brute_distances(layout: Layout) -> np.ndarray:
-    """int (cells, cells): steps between floor cells, by relaxing all triples (Floyd and Warshall)."""
+    """Return the numbers of steps between floor cells, int (cells, cells), by the Floyd-Warshall algorithm."""
     distance = np.full((layout.cells, layout.cells), NOWHERE)
     for cell, letter in enumerate("".join(layout.rows)):
         if letter in " A":
@@ -42,7 +42,7 @@ def brute_distances(layout: Layout) -> np.ndarray:
 
 
 def brute_first_step(layout: Layout, origin: int, target: int) -> int:
-    """Return the first action, right, down, left, up, that starts a shortest path."""
+    """Return the first of the actions right, down, left, up that starts a shortest path."""
     left = brute_distances(layout)[origin, target]
     if left in (0, NOWHERE):
         return STAY
@@ -50,7 +50,7 @@ def brute_first_step(layout: Layout, origin: int, target: int) -> int:
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_paths_equal_brute_force(name):
+def test_path_tables_equal_brute_force_search(name):
     layout = LAYOUTS[name]
     tables = layout.tables
     np.testing.assert_array_equal(tables.distance, brute_distances(layout))

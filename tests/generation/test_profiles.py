@@ -1,4 +1,4 @@
-"""Profiles, the tasks they list, and task files."""
+"""Profiles of releases, the tasks that profiles list, and task files."""
 
 from __future__ import annotations
 
@@ -52,10 +52,7 @@ def changed(tmp_path) -> Callable[[str, str], str]:
     return write
 
 
-# Shipped profiles.
-
-
-def test_names_are_the_shipped_files():
+def test_profile_names_are_the_shipped_files():
     assert profile_names() == sorted(path.stem for path in FOLDER.glob("*.toml"))
     assert {"mini", "paper", "smoke"} <= set(profile_names())
 
@@ -63,7 +60,7 @@ def test_names_are_the_shipped_files():
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "teach")) for name in profile_names()]
 )
-def test_shipped_profiles_load(name):
+def test_shipped_profiles_list_valid_tasks(name):
     profile = load_profile(name)
     assert profile.name == name
     assert profile.ego.updates > 0
@@ -94,7 +91,7 @@ def test_paper_profile_has_the_papers_numbers():
     assert set(profile.layouts) == {layout for splits in TRACKS.values() for layout in splits["train"]}
 
 
-def test_settings_of_an_artefact_are_the_task_the_learner_and_its_ego(changed):
+def test_artefact_settings_depend_on_task_learner_and_ego_only(changed):
     def settings(profile: Profile, learner: int = 0) -> dict:
         return artefact_settings(profile.units()[-1]._replace(learner=learner), profile)
 
@@ -109,7 +106,7 @@ def test_settings_of_an_artefact_are_the_task_the_learner_and_its_ego(changed):
     assert artefact_settings(other.units()[0], other) != artefact_settings(plain.units()[0], plain)
 
 
-def test_given_hyper_parameters_replace_the_profiles_and_enter_its_hashes(changed):
+def test_given_hyperparameters_replace_those_of_the_profile(changed):
     profile = load_profile(changed("keep = 8", "keep = 8"))
     assert profile.with_ego({}) == profile
     other = profile.with_ego({"learning_rate": 1e-3, "widths": {"gru": 4}})
@@ -123,10 +120,7 @@ def test_given_hyper_parameters_replace_the_profiles_and_enter_its_hashes(change
             profile.with_ego(given)
 
 
-# Profile files.
-
-
-def test_a_profile_by_its_path(changed):
+def test_profile_is_loaded_from_a_path(changed):
     profile = load_profile(changed("keep = 8", "keep = 5"))
     assert (profile.name, profile.keep, profile.data_version) == ("mine", 5, "0.2.0")
     assert profile.layouts == ("coord_simple", "cramped_up")
@@ -142,7 +136,7 @@ def test_a_profile_by_its_path(changed):
     ]
 
 
-def test_learned_teammates_on_some_layouts(changed):
+def test_learned_teammates_can_be_limited_to_some_layouts(changed):
     learned = 'algorithms = { cramped_room_up = ["fcp", "comedi"], coord_simple = [] }\npresets ='
     profile = load_profile(changed("presets =", learned))
     assert profile.algorithms == {"cramped_up": ("fcp", "comedi")}
@@ -150,7 +144,7 @@ def test_learned_teammates_on_some_layouts(changed):
     assert profile.tasks_on("cramped_up", "ppo") == 2 + 2 * profile.teammates.train
 
 
-def test_sampled_teammates_of_both_sources(changed):
+def test_sampled_teammates_are_used_by_ppo_and_noise_tasks(changed):
     sampled = 'families = { coord_simple = ["assembly_line", "recipe_aware_button"], cramped_up = ["assembly_line"] }'
     profile = load_profile(
         changed(
@@ -166,7 +160,7 @@ def test_sampled_teammates_of_both_sources(changed):
     of_noise += [("noise", "cramped_up", "train", 0)] * 2 + [("noise", "cramped_up", "validation", 0)]
     assert made == of_ppo + of_noise
     assert len({work.name for work in units}) == len(units) == 11
-    assert len({work.task.seed for work in units}) == 9  # the learners of a task share its seed
+    assert len({work.task.seed for work in units}) == 9  # two learners share a task's seed
     assert units[0].name + "-l1" == units[1].name
     teammates = [(w.task.layout, json.dumps(w.task.teammate["theta"])) for w in units if w.source == "noise"]
     assert len(set(teammates)) == len(teammates)
@@ -181,8 +175,8 @@ def test_sampled_teammates_of_both_sources(changed):
 
 
 @pytest.fixture
-def listed(monkeypatch) -> None:
-    """Lists of teammates on the two layouts, in place of the shipped ones: four for training, one for validation."""
+def small_lists(monkeypatch) -> None:
+    """Replace the shipped lists of spread teammates by four training and one validation teammate on two layouts."""
 
     def spread(layout: str) -> LayoutSpread:
         chosen = tuple(
@@ -200,7 +194,7 @@ def spread_profile(changed, more: str, spread: str = "per_layout = 2\nppo = 1\nv
     return load_profile(changed(PRESETS, f'sources = ["ppo", "noise"]\n{more}\n[tasks.spread]\n{spread}'))
 
 
-def test_spread_teammates_of_both_sources(changed, listed):
+def test_spread_teammates_are_used_by_ppo_and_noise_tasks(changed, small_lists):
     units = spread_profile(changed, "").units()
     for layout in ("coord_simple", "cramped_up"):
         own = [work for work in units if work.task.layout.name == layout]
@@ -217,7 +211,7 @@ def test_spread_teammates_of_both_sources(changed, listed):
     assert not {*seeds[: len(units)]} & {work.task.seed for work in sampled}
 
 
-def test_a_profile_says_what_differs_from_its_base(tmp_path):
+def test_profile_overrides_settings_of_its_base(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('base = "search"\n[search]\nepisodes = 12\n[search.layouts.asymm_both_plain]\nhistories = 3\n')
     mine, base = load_profile(str(path)), load_profile("search")
@@ -229,7 +223,7 @@ def test_a_profile_says_what_differs_from_its_base(tmp_path):
         load_profile(str(path))
 
 
-def test_sampled_and_spread_teammates_on_other_layouts(changed, listed):
+def test_sampled_and_spread_teammates_must_be_on_different_layouts(changed, small_lists):
     sampled = f"sampled = {{ {H3}, per_layout = {{ coord_simple = 1 }} }}"
     profile = spread_profile(changed, sampled, "per_layout = { cramped_up = 2 }")
     assert [profile.tasks_on(layout, "noise") for layout in profile.layouts] == [1, 2]
@@ -237,14 +231,14 @@ def test_sampled_and_spread_teammates_on_other_layouts(changed, listed):
         spread_profile(changed, sampled)
 
 
-def test_more_spread_teammates_than_the_list_has(changed, listed):
+def test_profile_with_too_many_spread_teammates_raises_error(changed, small_lists):
     with pytest.raises(OptionError, match=r"mine.toml: coord_simple: 5 train teammates requested of .* which has 4"):
         spread_profile(changed, "", "per_layout = 5")
     with pytest.raises(OptionError, match=r"2 validation teammates requested of .* which has 1"):
         spread_profile(changed, "", "per_layout = 4\nvalidation = 2")
 
 
-def test_no_validation_teammate_trains(changed, monkeypatch):
+def test_validation_teammate_that_also_trains_raises_error(changed, monkeypatch):
     entry = heuristic_teammate("utility_greedy", "high_inertia", 3)
     monkeypatch.setattr(profile_module, "spread_teammates", lambda layout, split, count: [entry] * count)
     counts = "per_layout = 0\nvalidation = { coord_simple = 1 }"
@@ -253,7 +247,7 @@ def test_no_validation_teammate_trains(changed, monkeypatch):
         spread_profile(changed, PRESETS, counts)
 
 
-def test_presets_of_both_sources(changed):
+def test_preset_teammates_are_used_by_ppo_and_noise_tasks(changed):
     units = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\npresets =')).units()
     assert [(work.source, work.task.seed) for work in units] == [
         *(("ppo", seed) for seed in range(4)),
@@ -262,8 +256,8 @@ def test_presets_of_both_sources(changed):
     assert [work.task.teammate for work in units[:4]] == [work.task.teammate for work in units[4:]]
 
 
-def test_given_tasks_have_the_sources_that_they_had(changed):
-    """As those of a release, which say in their provenance how their histories were made."""
+def test_given_tasks_keep_their_recorded_sources(changed):
+    """The tasks of a release have the sources that the release's provenance states."""
     profile = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\nlearners = 2\npresets ='))
     tasks = [work.task for work in profile.units() if work.learner == 0][:3]
     first, second, third = (task.task_id for task in tasks)
@@ -320,21 +314,18 @@ H3 = 'families = ["assembly_line"]'
         ("[ego]", "[ego", r"Expected '\]' at the end of a table declaration \(at line 2"),
     ],
 )
-def test_faults_are_named_with_the_file(changed, old, new, named):
+def test_invalid_profile_raises_error_with_its_name(changed, old, new, named):
     path = changed(old, new)
     with pytest.raises(OptionError, match=rf"(?s)mine.*{named}"):
         load_profile(path)
 
 
-def test_unknown_profile_name():
+def test_unknown_profile_name_raises_error():
     with pytest.raises(UnknownNameError, match=r"unknown profile 'smoek'; valid: .*Did you mean 'smoke'"):
         load_profile("smoek")
 
 
-# Tasks.
-
-
-def test_an_id_depends_on_every_part_of_its_task():
+def test_task_id_depends_on_every_field_of_the_task():
     def hashed(track="teammate", split="train", layout="demo_cook_wide", preset="default", theta_id=0, seed=0) -> str:
         teammate = heuristic_teammate("utility_greedy", preset, theta_id)
         return task_id(Task("", track, split, layout, seed, teammate))[-8:]
@@ -344,7 +335,7 @@ def test_an_id_depends_on_every_part_of_its_task():
     assert len({hashed(), *others}) == 7
 
 
-def test_tasks_know_both_names_of_a_layout_and_where_it_belongs():
+def test_tasks_accept_both_names_of_a_layout_but_only_of_their_track():
     teammate = heuristic_teammate("utility_greedy", "default", 0)
     short, long = (make_task("teammate", "train", name, teammate, 0) for name in ("coord_ring", "grounded_coord_ring"))
     assert short == long
@@ -354,7 +345,7 @@ def test_tasks_know_both_names_of_a_layout_and_where_it_belongs():
         make_task("layout", "train", "asymm_right", teammate, 0)
 
 
-def test_task_files_round_trip(tmp_path):
+def test_task_file_is_read_as_written(tmp_path):
     tasks = [work.task for work in load_profile("mini").units()]
     path = tmp_path / "tasks.jsonl"
     write_tasks(path, tasks)
@@ -379,7 +370,7 @@ def test_task_files_round_trip(tmp_path):
         (lambda one, two: "[1, 2]", r"expected `object`, got `array`; expected the fields .*, found \[1, 2\]"),
     ],
 )
-def test_faults_of_task_files_are_named_with_the_line(tmp_path, change, message):
+def test_invalid_task_file_raises_error_with_line_number(tmp_path, change, message):
     first, second = (json.dumps(task_fields(work.task)) for work in load_profile("mini").units()[:2])
     changed = json.dumps(json.loads(second) | change) if isinstance(change, dict) else change(first, second)
     path: Path = tmp_path / "tasks.jsonl"
@@ -388,8 +379,8 @@ def test_faults_of_task_files_are_named_with_the_line(tmp_path, change, message)
         read_tasks(path)
 
 
-def test_threads_are_chosen_before_teammates_are_drawn(monkeypatch):
-    """Drawing starts JAX, whose number of threads can then no longer change."""
+def test_number_of_threads_is_set_before_teammates_are_drawn(monkeypatch):
+    """Drawing teammates starts JAX, and JAX's number of threads cannot change afterwards."""
     calls: list[str] = []
     units = Profile.units
     monkeypatch.setattr(Profile, "units", lambda profile: calls.append("units") or units(profile))

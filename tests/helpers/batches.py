@@ -1,4 +1,4 @@
-"""Samplers of each kind, equality of batches, a digest of batches."""
+"""Helpers of sampling tests: samplers of each kind, a comparison of batches, and a hash of batches."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ CACHES: tuple[CacheMode, ...] = ("ram", "mmap", "stream")
 
 
 def samplers(dataset, **options):
-    """Return samplers of each kind and order."""
+    """Return AD and DPT samplers with different lengths and orders."""
     return [
         dataset.ad(batch_size=6, length=50, teammate_actions=True, **options),
-        dataset.ad(batch_size=6, length=130, **options),  # longer than the histories
+        dataset.ad(batch_size=6, length=130, **options),  # windows longer than the histories
         dataset.ad(batch_size=6, length=50, every=2, **options),
         dataset.dpt(batch_size=6, context=17, **options),
         dataset.dpt(batch_size=6, context=17, order="random", teammate_actions=True, **options),
@@ -25,14 +25,14 @@ def samplers(dataset, **options):
 
 
 def assert_equal(one, two) -> None:
-    """Assert that two batches have equal arrays, and None for the same fields."""
+    """Assert that two batches have equal arrays and that the same fields are None."""
     assert one._fields == two._fields
     for name, array in one._asdict().items():
         np.testing.assert_array_equal(array, getattr(two, name), err_msg=name, strict=True)
 
 
 def digest(root: Path) -> str:
-    """Return the SHA-256 of a few batches of each kind and order."""
+    """Return the SHA-256 of a few AD and DPT batches of a release's layout demo_wide."""
     dataset = load_icrl4aht(root, layout="demo_wide")
     samplers = [
         dataset.ad(batch_size=5, length=40, seed=7, teammate_actions=True),

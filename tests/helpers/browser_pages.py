@@ -1,4 +1,4 @@
-"""A decoder of the pages of `icrl4aht-data browse`, written from their description, not from the code of the page."""
+"""A decoder of the pages that `icrl4aht-data browse` writes, independent of the page's JavaScript."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 
 def embedded(html: bytes) -> tuple[dict[str, Any], list[bytes]]:
-    """Return a page's index and the decompressed data of each of its histories."""
+    """Return the index of a page and the decompressed data of each of the page's histories."""
     (text,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', html.decode(), re.DOTALL)
     data = json.loads(text)
     index, *histories = (zlib.decompress(base64.b64decode(one)) for one in (data["index"], *data["histories"]))
@@ -20,7 +20,7 @@ def embedded(html: bytes) -> tuple[dict[str, Any], list[bytes]]:
 
 
 def episodes(index: dict[str, Any], facts: dict[str, Any], content: bytes) -> dict[int, dict[str, np.ndarray]]:
-    """Return the frames of each episode with frames: number -> "state" uint8 (frames, S) and the other columns."""
+    """Return the frames of each shown episode: number -> "state" uint8 (frames, S) and the other columns."""
     size, names = index["layouts"][facts["layout"]]["record_size"], facts["columns"]
     columns = np.frombuffer(content, np.uint8).reshape(size + len(names), sum(facts["frames"]))
     named = {"state": columns[:size].T, **dict(zip(names, columns[size:], strict=True))}

@@ -1,4 +1,4 @@
-"""The installed Chromium that opens HTML pages in tests; without one, tests that are marked so are skipped."""
+"""Open HTML pages in the installed Chromium; tests marked `NEEDS_CHROMIUM` are skipped if none is installed."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ PHONE = 390
 
 @contextmanager
 def chromium() -> Iterator[Callable[..., Any]]:
-    """Start a browser; yield a function that opens a page by its address, in a window of a width and a color scheme.
+    """Start a browser; yield a function that opens an address in a window of a given width and color scheme.
 
-    Check in the end that no page had an error, and that no page on the disk requested a file of a server.
+    At the end, check that no page had an error and that no local page requested a file from a server.
     """
     playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra browser")
     with playwright.sync_playwright() as driver:
@@ -49,7 +49,7 @@ def chromium() -> Iterator[Callable[..., Any]]:
 def wait_until(page: Any, condition: str, seconds: float = 30) -> None:
     """Wait until a JavaScript expression is true.
 
-    Playwright's own function of this kind calls `eval` in the page, which the page's security policy forbids.
+    Playwright's `wait_for_function` calls `eval` in the page, which the page's security policy forbids.
     """
     end = time.monotonic() + seconds
     while not page.evaluate(condition):
@@ -58,7 +58,7 @@ def wait_until(page: Any, condition: str, seconds: float = 30) -> None:
 
 
 def check_phone(page: Any, dark: bool) -> None:
-    """Check that a page does not scroll sideways on a phone, and that its background is of its color scheme."""
+    """Check that a page does not scroll sideways on a phone, and that its background is dark if `dark` is true."""
     assert page.evaluate("document.documentElement.scrollWidth") == PHONE
     shade = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
     assert (max(shade) < 60) is dark

@@ -1,4 +1,4 @@
-"""Helpers that run the command-line program, in this process or in another."""
+"""Helpers that run the command-line program in this process, or Python in a new process."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.helpers.paths import ROOT
 
 
 def run_cli(*words: object, code: int = 0, program: Command = cli) -> str:
-    """Run a command of the program, check its exit code, and return what it prints; errors of the package are raised.
+    """Run a command in this process, check its exit code, and return its output; exceptions are raised.
 
     Args:
-        words: the command and its arguments, or one text of them.
-        code: exit code of the program.
-        program: the program, if it is another one.
+        words: the command and its arguments, as separate words or as one string to split.
+        code: expected exit code.
+        program: click command to run, by default the program icrl4aht-data.
     """
     arguments = words[0].split() if len(words) == 1 and isinstance(words[0], str) else [str(word) for word in words]
     result = CliRunner().invoke(program, arguments)
@@ -31,13 +31,13 @@ def run_cli(*words: object, code: int = 0, program: Command = cli) -> str:
 
 
 def run_python(*arguments: object, code: int = 0, cwd: Path = ROOT, **environment: str) -> str:
-    """Run Python in a process of its own, check its exit code, and return what it prints on both streams.
+    """Run Python in a new process, check its exit code, and return its standard output followed by its errors.
 
     Args:
-        arguments: of Python, such as "-c" and a program.
-        code: exit code of the process.
-        cwd: working folder.
-        environment: variables added to those of this process.
+        arguments: arguments of Python, such as "-c" and a program.
+        code: expected exit code of the process.
+        cwd: working folder of the process.
+        environment: variables added to the environment of this process.
     """
     command = [sys.executable, *map(str, arguments)]
     variables = os.environ | environment

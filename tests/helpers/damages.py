@@ -1,4 +1,4 @@
-"""Ways in which a file can be damaged."""
+"""Functions that damage a file in different ways."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ def flip_bit(path: Path, position: int = -1, bit: int = 0) -> None:
     path.write_bytes(bytes(data))
 
 
-def _flip_unnoticed(path: Path) -> None:
-    """Invert one bit and set the times back."""
+def _flip_bit_keeping_times(path: Path) -> None:
+    """Invert one bit of a file and restore the file's access and modification times."""
     before = path.stat()
     flip_bit(path, before.st_size // 2, 3)
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
 def _replace(path: Path) -> None:
-    """Put a valid file with another array in its place, as another program might."""
+    """Replace a file by a valid NumPy file with another array."""
     np.save(path.with_name("other.npy"), np.arange(7))
     path.with_name("other.npy").replace(path)
 
@@ -53,7 +53,7 @@ def _make_pipe(path: Path) -> None:
 
 DAMAGES: dict[str, Callable[[Path], object]] = {
     "a bit flipped": flip_bit,
-    "a bit flipped, times as before": _flip_unnoticed,
+    "a bit flipped, times as before": _flip_bit_keeping_times,
     "empty": lambda path: path.write_bytes(b""),
     "cut off": lambda path: os.truncate(path, path.stat().st_size // 2),
     "longer": lambda path: os.truncate(path, path.stat().st_size + 1),
@@ -64,11 +64,11 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
     "a dangling link": _make_link,
     "a pipe": _make_pipe,
 }
-"""Name -> function that damages a file, which exists."""
+"""Name of a damage -> function that damages an existing file in this way."""
 
 
 def restore(path: Path, data: bytes) -> None:
-    """Write a file again, whatever is there."""
+    """Write a file with the given content, after removing the file, folder or link at its path."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

@@ -1,4 +1,4 @@
-"""Results of evaluation as runs and folders, and best responses, without playing."""
+"""Invented evaluation results, as runs and as folders, and invented best responses."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def evaluated_run(
     details=None,
     steps=100,
 ) -> EvaluationRun:
-    """Every instance earns `value`, and 2 more in the second half.
+    """Return a run whose results have return `value` in the first half of the episodes and `value` + 2 in the second.
 
     Args:
-        note: text that distinguishes runs of an agent.
-        tasks: by default the published test tasks of the layouts and families.
-        trained_on: record of training data; None for results without one.
-        acting: way of acting of a trained model; None for other agents.
-        details: further details of the agent.
+        note: text that distinguishes the runs of one agent.
+        tasks: evaluated tasks, by default the published test tasks of `layouts` and `families`.
+        trained_on: the agent's record of training data; None for results without such a record.
+        acting: how a trained model chooses actions, a detail of its results; None for other agents.
+        details: further details of the agent, by name.
         steps: length of the episodes.
     """
     played = tasks or [task for task in TEST_TASKS if task.layout.name in layouts and task.teammate_family in families]
@@ -56,11 +56,11 @@ def evaluated_run(
 
 
 SPAN = 20.0
-"""How much more best responses of `write_measured` earn than `stay`, in cells where the oracle earns more."""
+"""Margin over `stay` of the best responses that `write_measured` invents, for teammates with headroom."""
 
 
 def write_measured(path: Path) -> Path:
-    """Write best responses to all test tasks; the five teammates of H4 in a cell share one behaviour."""
+    """Write best responses to all test tasks; on each layout, the five H4 teammates share one behaviour."""
     stays, headroom, behaviours = stay_returns("seeded"), read_headroom("seeded"), []
     for (layout, family), egos in headroom.items():
         tasks = [task for task in TEST_TASKS if (task.layout.name, task.teammate_family) == (layout, family)]
@@ -81,11 +81,11 @@ def write_results(
     offset=0.0,
     **details,
 ) -> Path:
-    """Write results of all test tasks of a track as `evaluate` does, the same curve of 100 returns for each seed.
+    """Write results of all test tasks of a track as `evaluate` does, with the same curve of 100 returns for each seed.
 
     Args:
         details: further details of the agent, such as `forget`.
-        offset: added to the returns with the second teammate of a family, twice with the third, and so on.
+        offset: number that is added to all returns, times the index of the teammate in its family.
     """
     settings = {"agent": agent, "seeds": [0, 1, 2], "protocol": get_protocol("seeded").settings}
     details |= {} if trained_on is None else {"trained_on": [*trained_on]}

@@ -1,4 +1,4 @@
-"""JaxMARL's OvercookedV2 as reference of the rules: states translated both ways."""
+"""Conversion of states to and from JaxMARL's OvercookedV2, the reference implementation of the rules."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TO_PEER_ACTION = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS])
 
 
 def to_peer_item(layout: Layout, item: np.ndarray) -> np.ndarray:
-    """Item bytes -> the peer's item codes, which have two bits for every id, piled or not."""
+    """Convert our item bytes to JaxMARL's item codes, which have two bits for every ingredient of the game."""
     item = item.astype(np.int32)
     code = item & 3
     for k, ingredient in enumerate(layout.ingredients):
@@ -26,7 +26,7 @@ def to_peer_item(layout: Layout, item: np.ndarray) -> np.ndarray:
 
 
 def to_our_item(layout: Layout, code: np.ndarray) -> np.ndarray:
-    """The peer's item codes -> item bytes."""
+    """Convert JaxMARL's item codes to our item bytes."""
     item = code & 3
     for k, ingredient in enumerate(layout.ingredients):
         item |= (code >> (2 + 2 * ingredient) & 3) << (2 + 2 * k)
@@ -34,7 +34,7 @@ def to_our_item(layout: Layout, code: np.ndarray) -> np.ndarray:
 
 
 def to_peer_state(layout: Layout, env: OvercookedV2, records: np.ndarray) -> PeerState:
-    """Records uint8 (B, S) -> the peer's batched state."""
+    """Convert state records uint8 (B, S) to JaxMARL's batched state."""
     ours = unpack(layout, records)
     batch, shape = len(records), (layout.height, layout.width)
     grid = np.zeros((batch, layout.cells, 3), np.int32)
@@ -59,7 +59,7 @@ def to_peer_state(layout: Layout, env: OvercookedV2, records: np.ndarray) -> Pee
 
 
 def from_peer_state(layout: Layout, state: PeerState) -> np.ndarray:
-    """The peer's batched state -> records uint8 (B, S), written without our own packing code."""
+    """Convert JaxMARL's batched state to records uint8 (B, S), without the package's packing code."""
     position = np.asarray(state.agents.pos.y) * layout.width + np.asarray(state.agents.pos.x)
     grid = np.asarray(state.grid).reshape(len(position), layout.cells, 3)
     columns = [
@@ -77,12 +77,12 @@ def from_peer_state(layout: Layout, state: PeerState) -> np.ndarray:
 
 
 def peer_step(env: OvercookedV2):
-    """A jitted batched step of (keys, states, actions (B, 2) in the peer's ids)."""
+    """Return a jitted batched step of JaxMARL's environment: (keys, states, actions (B, 2) in JaxMARL's ids)."""
 
-    def one(key, state, actions):
+    def single_step(key, state, actions):
         obs, state, reward, _, info = env.step_env(key, state, {"agent_0": actions[0], "agent_1": actions[1]})
         shaped = info["shaped_reward"]
         both = jnp.stack([obs["agent_0"], obs["agent_1"]])
         return both, state, reward["agent_0"], jnp.stack([shaped["agent_0"], shaped["agent_1"]])
 
-    return jax.jit(jax.vmap(one))
+    return jax.jit(jax.vmap(single_step))

@@ -1,4 +1,4 @@
-"""Jobs of a queue that write files. Workers import this module, so it imports little."""
+"""A job that writes a file, for tests of the job queue. Worker processes import this module, so it imports little."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icrl4aht_generation.learners.resume import BusyError
 
 @dataclass(frozen=True)
 class FileJob:
-    """Writes the number of its process into a file; fails in its first `failures` attempts."""
+    """A job that writes its process id into a file, and fails in its first `failures` attempts."""
 
     out: Path
     name: str

@@ -1,4 +1,4 @@
-"""Execution of the notebooks of docs/notebooks. `python -m tests.helpers.notebooks [NAME...]` stores their outputs."""
+"""Execute the notebooks of docs/notebooks. `python -m tests.helpers.notebooks [NAME...]` stores their outputs."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 
 def execute(path: Path, folder: Path, changes: Mapping[str, str] | None = None) -> Any:
-    """Return a notebook with the outputs of a new kernel that runs in a folder.
+    """Execute a notebook in a new kernel and return the notebook with its outputs.
 
     Args:
-        path: the notebook.
+        path: path of the notebook.
         folder: working folder of the kernel.
-        changes: texts of cells -> texts to execute in place of them.
+        changes: replacements in the cells' code, old text -> new text.
 
     Raises:
         CellExecutionError: if a cell fails.
@@ -46,26 +46,26 @@ def execute(path: Path, folder: Path, changes: Mapping[str, str] | None = None) 
 
 
 def outputs(notebook: Any) -> Iterator[Any]:
-    """Yield the outputs of a notebook's cells."""
+    """Yield the outputs of all cells of a notebook."""
     for cell in notebook.cells:
         yield from cell.get("outputs", ())
 
 
 def store(path: Path) -> None:
-    """Execute a notebook and write it with its outputs, without times and with general names of folders."""
+    """Execute a notebook and store its outputs, without times and with neutral names of folders."""
     import nbformat
 
     with tempfile.TemporaryDirectory() as folder:
         notebook = execute(path, Path(folder))
-    text = re.sub(r"(?<=data:image/png;base64,)[\w+/=]+", _shrunk, nbformat.writes(_without_times(notebook)))
+    text = re.sub(r"(?<=data:image/png;base64,)[\w+/=]+", _shrink_image, nbformat.writes(_remove_times(notebook)))
     for found, shown in ((str(ROOT), "/home/you/icrl4aht-data"), (folder, "/home/you/work")):
         text = text.replace(found, shown)
     path.write_text(text + "\n", encoding="utf-8")
     print(f"wrote {path}: {path.stat().st_size // 1000} kB")
 
 
-def _shrunk(picture: re.Match[str]) -> str:
-    """Return a PNG file in base64 with 64 colours."""
+def _shrink_image(picture: re.Match[str]) -> str:
+    """Reduce a base64-encoded PNG image to 64 colours."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
         path.write_bytes(base64.b64decode(picture[0]))
@@ -73,12 +73,12 @@ def _shrunk(picture: re.Match[str]) -> str:
         return base64.b64encode(path.read_bytes()).decode()
 
 
-def _without_times(notebook: Any) -> Any:
+def _remove_times(notebook: Any) -> Any:
     for number, cell in enumerate(notebook.cells):
         cell["id"] = f"cell-{number:02}"
         cell["metadata"] = {}
         if cell.cell_type == "code":
-            cell["outputs"] = _joined(cell["outputs"])
+            cell["outputs"] = _join_text(cell["outputs"])
     notebook["metadata"] = {
         "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
         "language_info": {"name": "python"},
@@ -86,13 +86,13 @@ def _without_times(notebook: Any) -> Any:
     return notebook
 
 
-def _joined(found: list[Any]) -> list[Any]:
-    """Return outputs of which each piece of text is joined to the one before it."""
+def _join_text(found: list[Any]) -> list[Any]:
+    """Join consecutive pieces of text of the same stream in a cell's outputs."""
     joined: list[Any] = []
     for output in found:
         output.get("metadata", {}).clear()
         if output["output_type"] == "stream":
-            output["text"] = re.sub(r"\x1b\[[0-9;]*m", "", output["text"])  # colours
+            output["text"] = re.sub(r"\x1b\[[0-9;]*m", "", output["text"])  # remove color codes
         if (
             joined
             and output["output_type"] == joined[-1]["output_type"] == "stream"

@@ -1,4 +1,4 @@
-"""Folders of the repository that tests read."""
+"""Paths of the repository's folders that tests read."""
 
 from __future__ import annotations
 
@@ -13,4 +13,4 @@ PACKAGES = {
     "benchmarks": ROOT / "benchmarks",
     "tests": ROOT / "tests",
 }
-"""Import name -> folder of each package."""
+"""Import name -> source folder, for each package of the repository."""

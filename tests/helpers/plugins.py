@@ -1,4 +1,4 @@
-"""Packages that register objects by entry points: written as if installed, and put on Python's path."""
+"""Write and import test packages that register plugins by entry points, as installed packages do."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS
 def write_package(
     folder: Path, name: str, modules: Mapping[str, str], entry_points: Mapping[str, Mapping[str, str]]
 ) -> Path:
-    """Write a package of version 0.1 and its metadata, as an installer would; returns the folder.
+    """Write a package of version 0.1 and its metadata, as an installer would; return the folder.
 
     Args:
-        folder: a folder for Python's path.
-        name: of the distribution; that of the package has underscores instead of hyphens.
-        modules: name -> source.
-        entry_points: group -> name -> "module:object".
+        folder: folder to write into, to be put on Python's path.
+        name: name of the distribution; the package's name has underscores instead of hyphens.
+        modules: source code of each module by name.
+        entry_points: the registered objects as group -> name -> "module:object".
     """
     package, metadata = (folder / (name.replace("-", "_") + suffix) for suffix in ("", "-0.1.dist-info"))
     for path in (package, metadata):
@@ -41,7 +41,7 @@ def write_package(
 
 @contextmanager
 def installed(*folders: Path) -> Iterator[None]:
-    """Put folders of `write_package` on this process's path; what is registered is read again, also at the end."""
+    """Put folders of `write_package` on this process's Python path for a while, and find all plugins again."""
     with ExitStack() as stack:
         stack.enter_context(mock.patch.object(sys, "path", [*map(str, folders), *sys.path]))
         for plugins in (LAYOUT_PLUGINS, TEAMMATE_PLUGINS, METHOD_PLUGINS):

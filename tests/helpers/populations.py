@@ -1,4 +1,4 @@
-"""Small populations, and a plain implementation of the update of LBRDiv's multipliers."""
+"""Small populations, and a reference implementation of the update of LBRDiv's Lagrange multipliers."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def population(algorithm: Algorithm, config: PPOConfig = CONFIG, **options: Any)
     return Population(Environment(LAYOUT, max_steps=EPISODE), algorithm, config, **options)
 
 
-def plain_adapt(old: Multipliers, returns: np.ndarray, seen: np.ndarray, tolerance: float, rate: float) -> Multipliers:
-    """Return the multipliers that the LBRDiv paper computes, entry by entry; [i, j]: confederate i, best response j."""
+def paper_adapt(old: Multipliers, returns: np.ndarray, seen: np.ndarray, tolerance: float, rate: float) -> Multipliers:
+    """Return the multipliers by the LBRDiv paper, entry by entry; [i, j]: confederate i with best response j."""
     k = len(old.vertical)
     vertical, horizontal, latest = (np.array(x, np.float64) for x in old[:3])
     known = np.array(old.known)

@@ -1,4 +1,4 @@
-"""Published files as their authors write them."""
+"""Write small files in the published format, for tests that convert them."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.random_releases import random_history
 
 KEPT = 20
-"""Steps of an episode."""
+"""Number of steps of an episode."""
 SHARD = "data/teammate/demo_wide/train-00000-of-00001.h5"
-"""The shard of demo_wide in the release converted from the files."""
+"""Path of the demo_wide shard in the release converted from the published files."""
 
 _IDS = {name: number for number, name in enumerate(PUBLISHED_ACTIONS)}
 
 
 def publish(folder: Path) -> list[dict[str, np.ndarray]]:
-    """Write `histories.h5` and its index: no states, no tasks, optional fields, an unfinished last episode.
+    """Write `histories.h5` and its index, without states and tasks, and with an unfinished last episode.
 
     Returns:
-        The arrays of each history; actions are numbers of `ACTIONS`.
+        The arrays of each history; actions are indices into `ACTIONS`.
     """
     rng = np.random.default_rng(0)
     plans = [("demo_wide", "a", 120), ("demo_wide", "a", 130), ("coord_simple", "b", 60), ("demo_wide", "c", 50)]

@@ -1,4 +1,4 @@
-"""Histories of random actions, simulated by the NumPy rules: real states, rewards and episode ends, no learning."""
+"""Write releases of random play, simulated by the NumPy rules: valid states, rewards and episode ends, no learning."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from icrl4aht_data.overcooked.state import start_record
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
-"""The first shard of `random_release`."""
+"""Path of the first shard of a release that `random_release` writes."""
 
 
 def random_history(layout: Layout, episodes: int, length: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -57,7 +57,7 @@ def random_history(layout: Layout, episodes: int, length: int, rng: np.random.Ge
 
 
 def make_tasks(layouts: list[str], teammates: int = 1, recipes: Sequence[Dish] | None = None) -> list[Task]:
-    """Return tasks with heuristic teammates of unequal parameters, of the training split if the layout is in it."""
+    """Return tasks with different heuristic teammates, in split train if it contains the layout, else in test."""
     return [
         make_task(
             track_of(layout),
@@ -91,11 +91,11 @@ def random_release(
     swap: int | None = None,
     overwrite: bool = False,
 ) -> dict[int, dict[str, np.ndarray]]:
-    """Write a release of random actions; returns the written arrays by history id.
+    """Write a release of random actions; return the written arrays by history id.
 
-    `experts` and `sources` say where the labels and the histories of each task come from; `oracle` adds oracle actions,
-    equal to the labels where the source is "noise". Every learner has `streams` histories; a noise task has one. With
-    `swap` the layout's teammates are recorded as playing in turn, each this number of episodes.
+    `experts` and `sources` say where each task's labels and histories come from; `oracle` adds oracle actions, equal to
+    the labels if the source is "noise". Every learner has `streams` histories; a noise task has one learner. With
+    `swap`, the metadata say that the layout's teammates play in turn, each for this number of episodes.
     """
     rng = np.random.default_rng(seed)
     written: dict[int, dict[str, np.ndarray]] = {}
@@ -132,7 +132,7 @@ def one_history_release(
     learner: int = 0,
     copies: int = 1,
 ) -> Path:
-    """Write a release of one task on demo_simple, with valid hashes, whose history `change` has changed."""
+    """Write a release of one task on demo_simple with valid hashes, after passing the history's arrays to `change`."""
     (task,) = make_tasks(["demo_simple"])
     arrays = change(random_history(task.layout, 6, 20, np.random.default_rng(5)))
     histories = [NewHistory(number, arrays, learner) for number in range(copies)]
@@ -141,7 +141,7 @@ def one_history_release(
 
 
 def long_index(root: Path, lines: int = 3000) -> list[Entry]:
-    """Write the metadata of a release of `lines` histories, without shards; returns its entries."""
+    """Write the metadata of a release of `lines` histories, without shards; return the index entries."""
     source = load_icrl4aht(MINI).entries
     rng = np.random.default_rng(0)
     made = []

@@ -1,4 +1,4 @@
-"""Small models for observations of three numbers and four actions, and batches for them."""
+"""Small models for observations of three numbers and for four actions, and batches to train them on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FLAT = World(lambda dtype: FlatEncoder(8, dtype), (3,), plain_view, 4)
 
 
 def random_parameters(method: Method) -> Any:
-    """Return random parameters without the method's initialisation, which takes long to compile."""
+    """Return random parameters without calling the method's initialization, which takes long to compile."""
     rng = np.random.default_rng(1)
 
     def leaf(path, shape):

@@ -1,4 +1,4 @@
-"""Releases with false values under a valid manifest, and what `verify_release` says about them."""
+"""Put wrong values into releases whose checksums are valid, and list the problems that `verify_release` finds."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ Change = Callable[[Any], Any]
 
 
 def problems(root: Path, level: Level = "full") -> list[str]:
-    """Return the problems of a release as texts `<file>: <problem>`."""
+    """Return the problems that `verify_release` finds in a release, as texts `<file>: <problem>`."""
     return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, level=level).findings]
 
 
 def read_lines(path: Path) -> list[Any]:
-    """Return the content of a JSONL file."""
+    """Return the parsed lines of a JSONL file."""
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
 def change_file(path: Path, change: Change) -> None:
-    """Change the content of a JSON or JSONL file in place."""
+    """Apply a function that changes the content of a JSON or JSONL file in place."""
     is_lines = path.suffix == ".jsonl"
     content = read_lines(path) if is_lines else json.loads(path.read_text())
     change(content)
@@ -34,13 +34,13 @@ def change_file(path: Path, change: Change) -> None:
 
 
 def spoil(root: Path, name: str, change: Change) -> None:
-    """Change the content of a JSON or JSONL file of a release, and write a matching manifest."""
+    """Change a JSON or JSONL file of a release, and update the manifest with the file's new checksum."""
     change_file(root / name, change)
     write_manifest(root)
 
 
 def spoiled(source: Path, target: Path, name: str, change: Change) -> Path:
-    """Copy a release and change one of its files, see `spoil`."""
+    """Copy a release and change one file of the copy by `spoil`."""
     shutil.copytree(source, target)
     spoil(target, name, change)
     return target

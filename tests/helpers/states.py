@@ -1,4 +1,4 @@
-"""State records: random ones of every kind, and hand-made ones."""
+"""Make state records of the game, random or from given fields."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.state import (
 
 
 def random_records(layout: Layout, size: int, rng: np.random.Generator) -> np.ndarray:
-    """uint8 (size, S): states of every kind that the rules allow, rich in full hands, pots and counters."""
+    """Return random valid state records uint8 (size, S), most with items in hands, in pots and on counters."""
     items = possible_items(layout).nonzero()[0]
     counts = ingredient_count(items)
     in_pot = items[items & PLATE == 0]
@@ -36,7 +36,7 @@ def random_records(layout: Layout, size: int, rng: np.random.Generator) -> np.nd
     clash = positions[:, 0] == positions[:, 1]
     positions[clash] = layout.rooms[0][0], layout.rooms[1][-1]
     pots, buttons, counters = len(layout.pots), len(layout.buttons), len(layout.counters)
-    pot_items = rng.choice(in_pot, (size, pots), p=_mostly_full(counts[items & PLATE == 0]))
+    pot_items = rng.choice(in_pot, (size, pots), p=_fullness_weights(counts[items & PLATE == 0]))
     raw_full = (ingredient_count(pot_items) == 3) & (pot_items & COOKED == 0)
     fill = rng.random((size, counters)) < rng.random((size, 1)) * 0.5
     return pack(
@@ -59,16 +59,16 @@ def random_records(layout: Layout, size: int, rng: np.random.Generator) -> np.nd
     )
 
 
-def _mostly_full(counts: np.ndarray) -> np.ndarray:
+def _fullness_weights(counts: np.ndarray) -> np.ndarray:
     weight = np.where(counts >= 2, 2.0, 1.0)
     return weight / weight.sum()
 
 
 def state_record(layout: Layout, ego: tuple[int, int, str], teammate: tuple[int, int, str], **fields) -> np.ndarray:
-    """uint8 (1, S): a state with agents at (x, y, facing) and the given fields; the rest is empty.
+    """Return a state record uint8 (1, S) with agents at (x, y, facing) and the given fields; other fields are empty.
 
-    Fields: hands=(ego's, teammate's), recipe, delivered, pot_items, pot_timers, buttons as sequences, and
-    counters={(x, y): item}.
+    Fields are hands=(ego's item, teammate's item), recipe, delivered, the sequences pot_items, pot_timers and buttons,
+    and counters={(x, y): item}.
     """
     record = np.zeros((1, record_size(layout)), np.uint8)
     where = columns(layout)

@@ -1,4 +1,4 @@
-"""Profiles of the smallest rebuilds, and Python processes that run them."""
+"""Profiles that generate tiny releases, and a function that starts Python processes."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ keep = 3
 layouts = ["demo_wide"]
 presets = ["default"]
 """
-"""One task, 25 updates."""
+"""Profile of one task and 25 PPO updates."""
 
 PAIR = TINY.replace('presets = ["default"]', 'presets = ["default", "high_inertia"]')
-"""The task of `TINY`, and one with another teammate."""
+"""Profile with the task of `TINY` and a second task with another teammate."""
 
 LEARNED = TINY.replace('presets = ["default"]', 'algorithms = ["fcp", "brdiv"]').replace(
     "[release]",
@@ -47,16 +47,16 @@ widths = { pointwise = [4], spatial = [4], dense = 8, gru = 8, head = 8 }
 
 [release]""",
 )
-"""Two tasks with learned teammates."""
+"""Profile of two tasks with learned teammates."""
 
 
 def artefact(out: Path, number: int = 0) -> Path:
-    """Return the folder of a finished task; tasks are numbered in the order of their ids."""
+    """Return the folder of a finished task; `number` is the position of the task's id in sorted order."""
     return sorted(path for path in (out / "artefacts").iterdir() if path.is_dir())[number]
 
 
 def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
-    """Start Python in the repository, with variables added to the environment."""
+    """Start Python with the repository as working folder, and with variables added to the environment."""
     return subprocess.Popen(
         [sys.executable, *arguments],
         stdout=subprocess.PIPE,
@@ -85,4 +85,4 @@ layouts = ["demo_wide"]
 sources = ["noise"]
 presets = ["default"]
 """
-"""Noise histories: 40 episodes of each task."""
+"""Profile of one task with 4 noise histories of 10 episodes."""

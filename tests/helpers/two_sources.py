@@ -1,4 +1,4 @@
-"""A release with both sources, the splits train and validation, two learners a task and both kinds of labels."""
+"""Write a release with histories of both sources (PPO and noise), two splits and both kinds of labels."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.random_releases import random_history
 
 EPISODES, LENGTH = 6, 20
-"""Episodes of every history, and their steps."""
+"""Number of episodes of every history, and number of steps of every episode."""
 
 NOISE: dict[str, Any] = {
     "histories": 3,
@@ -29,10 +29,10 @@ NOISE: dict[str, Any] = {
     "finish": [1.0, 1.0],
     "power": [1.0, 1.0],
 }
-"""The schedule of all noise histories: linear, from 1 to 0."""
+"""Schedule of all noise histories: the share of random actions falls linearly from 1 to 0."""
 
 PARTS = (("train", "ppo"), ("train", "noise"), ("validation", "noise"))
-"""Split and source of each layout's tasks, in the order of the index."""
+"""Split and source of each layout's tasks, in the order of the release's index."""
 
 
 def two_source_release(
@@ -46,11 +46,11 @@ def two_source_release(
     seed: int = 0,
     **options: Any,
 ) -> dict[int, dict[str, np.ndarray]]:
-    """Write a release with `tasks` tasks of each of `PARTS` on each layout; returns the written arrays by history id.
+    """Write a release with `tasks` tasks for each of `PARTS` on each layout; return the written arrays by history id.
 
-    A task of source ppo has two learners with two histories each, of `ppo_episodes` episodes, a task of source noise
-    three histories. States and rewards are those of random play by the rules: nobody learns. Histories of the sources
-    `oracle` are stored with oracle actions; other options are those of `write_release`.
+    A task of source ppo has two learners with two histories of `ppo_episodes` episodes each; a task of source noise has
+    three histories. All actions are random: no learner improves. Histories of the sources `oracle` are stored with
+    oracle actions; other options are passed to `write_release`.
     """
     rng = np.random.default_rng(seed)
     written: dict[int, dict[str, np.ndarray]] = {}
@@ -76,7 +76,7 @@ def two_source_release(
 
 
 def _tasks(layouts: tuple[str, ...], tasks: int) -> Iterator[tuple[Task, str]]:
-    """Tasks with teammates of all heuristic families in turn, each with its source; validation has other teammates."""
+    """Yield each task and its source; teammates are of all heuristic families, and differ between the splits."""
     for number, (layout, (split, source), _) in enumerate(itertools.product(layouts, PARTS, range(tasks))):
         teammate = {
             "kind": "heuristic",
@@ -89,7 +89,7 @@ def _tasks(layouts: tuple[str, ...], tasks: int) -> Iterator[tuple[Task, str]]:
 
 
 def _oracle_actions(actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Actions of which the chance to be those that were taken rises from 0 to 1 over the episodes."""
+    """Return labels that agree with the taken actions with a chance rising from 0 to 1 over the episodes."""
     chance = np.repeat(np.linspace(1.0, 0.0, len(actions) // LENGTH), LENGTH)
     return np.where(rng.random(len(actions)) < chance, rng.integers(0, 6, len(actions)), actions)
 

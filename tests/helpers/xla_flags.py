@@ -1,4 +1,4 @@
-"""XLA's flags of tests and their subprocesses."""
+"""XLA flags for tests and their subprocesses."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import sys
 
 
 def add_xla_flag(flag: str) -> str:
-    """Return the value of `XLA_FLAGS` with another flag: programs compiled with different flags may differ in bits."""
+    """Return the value of the variable `XLA_FLAGS` with a flag added, if it is missing."""
     flags = os.environ.get("XLA_FLAGS", "").split()
     return " ".join(flags if flag in flags else [*flags, flag])
 
 
 def is_xla_flag(flag: str) -> bool:
-    """Return whether the installed XLA knows a flag; with an unknown one, every process that uses it is aborted."""
+    """Return whether the installed XLA knows a flag; XLA aborts every process that sets an unknown flag."""
     environment = {**os.environ, "XLA_FLAGS": flag, "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", "import jax; jax.devices()"]
     return not subprocess.run(command, env=environment, capture_output=True, check=False).returncode

@@ -1,4 +1,4 @@
-"""Faults of a test server, and rules for when they happen."""
+"""Faults that a test server makes on purpose, and rules for when they happen."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from fnmatch import fnmatchcase
 
 @dataclass
 class Request:
-    """One request in a server's log. All but `sent` is logged before the first byte of the answer is sent.
+    """A request in a server's log, logged before the first byte of the answer is sent.
 
-    Rules see neither `status` nor `sent`, because the answer is not known yet.
+    The fields `status` and `sent` are set later: rules for faults cannot use them.
 
     Args:
-        method: GET, HEAD, ...
-        path: decoded and without the query.
+        method: HTTP method, such as GET or HEAD.
+        path: decoded path, without the query.
         target: path and query as the client sent them.
         headers: headers of the request.
-        status: status of the answer.
-        sent: bytes of the body that were written to the socket.
+        status: HTTP status of the answer.
+        sent: number of bytes of the answer's body that were written to the socket.
     """
 
     method: str
@@ -34,14 +34,14 @@ class Request:
 
 @dataclass(frozen=True)
 class Cut:
-    """Correct headers and `after` bytes of the body, then a closed socket."""
+    """Send correct headers and the first `after` bytes of the body, then close the connection."""
 
     after: int = 0
 
 
 @dataclass(frozen=True)
 class Status:
-    """Another status, with a line of text as the body."""
+    """Answer with an HTTP error status and a line of text instead of the content."""
 
     code: int
     headers: dict[str, str] = field(default_factory=dict)
@@ -49,7 +49,7 @@ class Status:
 
 @dataclass(frozen=True)
 class Slow:
-    """A wait of `delay` seconds before the answer, then at most `bytes_per_second`."""
+    """Wait `delay` seconds before the answer, then send at most `bytes_per_second`."""
 
     delay: float = 0.0
     bytes_per_second: float | None = None
@@ -57,28 +57,28 @@ class Slow:
 
 @dataclass(frozen=True)
 class Short:
-    """`by` bytes less than requested, in headers that agree with one another."""
+    """Send `by` bytes less than requested, with a Content-Length that agrees with the body."""
 
     by: int = 1
 
 
 @dataclass(frozen=True)
 class Long:
-    """`by` bytes more than requested, in headers that agree with one another; zeros past the end of the file."""
+    """Send `by` bytes more than requested (zeros past the file's end), with a Content-Length that agrees."""
 
     by: int = 1
 
 
 @dataclass(frozen=True)
 class Flip:
-    """A body of the right length, with the bits of the byte at `position` inverted."""
+    """Send a body of the right length, with the bits of the byte at `position` inverted."""
 
     position: int = 0
 
 
 @dataclass(frozen=True)
 class Redirect:
-    """A redirect to another path of this server, or to a URL."""
+    """Redirect to another path of this server, or to a URL."""
 
     to: str
 
@@ -88,9 +88,9 @@ Rule = Callable[[Request], Fault | None]
 
 
 class Faults:
-    """Rules in order: the first that returns a fault decides what goes wrong with a request. Thread safe.
+    """A list of rules: the first rule that returns a fault decides the fault of a request. Thread safe.
 
-    `path` is a pattern of fnmatch (`*` crosses `/`); `method` None is any method.
+    The path of a rule is a pattern of fnmatch (`*` also matches `/`); None as its method matches any method.
     """
 
     def __init__(self) -> None:
@@ -102,12 +102,12 @@ class Faults:
             return next((fault for rule in self._rules if (fault := rule(request)) is not None), None)
 
     def add(self, rule: Rule) -> None:
-        """Add a rule of the caller's own. Rules are called under a lock, so they may count."""
+        """Add a function that returns a request's fault or None; it is called under a lock, so it may count."""
         with self._lock:
             self._rules.append(rule)
 
     def next(self, fault: Fault, times: int = 1, path: str = "*", method: str | None = "GET") -> None:
-        """Add a fault of the next `times` requests that match."""
+        """Add a fault that applies to the next `times` requests that match `path` and `method`."""
         left = times
 
         def rule(request: Request) -> Fault | None:
@@ -120,6 +120,6 @@ class Faults:
         self.add(rule)
 
     def clear(self) -> None:
-        """Remove all rules."""
+        """Remove all rules for faults."""
         with self._lock:
             self._rules.clear()

@@ -1,4 +1,4 @@
-"""A folder served over HTTP on 127.0.0.1, and the server that the Hub and S3 build on."""
+"""Serve a folder over HTTP on 127.0.0.1, with the server class that the test Hub uses too."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from tests.servers.faults import (
 )
 
 BLOCK = 1 << 16
-PACE = 0.02  # seconds between the blocks of a slow body
+PACE = 0.02  # seconds between blocks if a body is sent slowly
 
 
 @dataclass(frozen=True)
 class Answer:
-    """HTTP response of a route.
+    """The HTTP response that a route returns.
 
     Args:
-        body: content, or the path of a file with it.
-        status: HTTP status.
-        headers: besides Content-Length.
+        body: content of the response, or the path of a file with the content.
+        status: HTTP status of the response.
+        headers: headers of the response except Content-Length.
     """
 
     body: bytes | Path = b""
@@ -51,7 +51,7 @@ Route = Callable[[Request, bytes], Answer]
 
 
 class Server(ThreadingHTTPServer):
-    """A server that answers by a route, logs every request, and does wrong what the faults say."""
+    """A server that answers by a function, logs every request, and makes the requested faults."""
 
     request_queue_size = 128
 
@@ -82,7 +82,7 @@ class Server(ThreadingHTTPServer):
             self._errors.append(error)
 
     def close(self) -> None:
-        """End every connection and every thread; raise the first error of the server itself."""
+        """Close all connections and end all threads; raise the first error that happened inside the server."""
         self.closing.set()
         self.shutdown()
         self._serving.join()
@@ -96,7 +96,7 @@ class Server(ThreadingHTTPServer):
 
 
 class Handler(BaseHTTPRequestHandler):
-    """One connection."""
+    """Handler of one connection to the server."""
 
     protocol_version = "HTTP/1.1"
     disable_nagle_algorithm = True
@@ -117,7 +117,7 @@ class Handler(BaseHTTPRequestHandler):
         if isinstance(fault, Slow):
             self.owner.closing.wait(fault.delay)
         if isinstance(fault, Status):
-            answer = Answer(b"as the test ordered\n", fault.code, fault.headers)
+            answer = Answer(b"error requested by the test\n", fault.code, fault.headers)
         elif isinstance(fault, Redirect):
             answer = Answer(b"", 302, {"Location": fault.to})
         else:
@@ -127,10 +127,10 @@ class Handler(BaseHTTPRequestHandler):
     do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = answer
 
     def _read_body(self) -> bytes:
-        """The complete body.
+        """Read the complete body of a request.
 
         Raises:
-            ConnectionAbortedError: if the client was killed before it had sent everything.
+            ConnectionAbortedError: if the connection ends before the complete body has arrived.
         """
         if self.headers.get("Transfer-Encoding", "").lower() != "chunked":
             return self._read(int(self.headers.get("Content-Length") or 0))
@@ -138,24 +138,24 @@ class Handler(BaseHTTPRequestHandler):
         while size := int(self._read_line().split(b";")[0], 16):
             chunks.append(self._read(size))
             self._read_line()
-        while self._read_line().strip():  # trailers
+        while self._read_line().strip():  # skip trailers
             pass
         return b"".join(chunks)
 
     def _read(self, size: int) -> bytes:
         found = self.rfile.read(size)
         if len(found) < size:
-            raise ConnectionAbortedError(f"{self.path}: {len(found)} of {size} bytes came")
+            raise ConnectionAbortedError(f"{self.path}: received {len(found)} of {size} bytes of the request")
         return found
 
     def _read_line(self) -> bytes:
         line = self.rfile.readline()
         if not line.endswith(b"\n"):
-            raise ConnectionAbortedError(f"{self.path}: cut in a body of chunks")
+            raise ConnectionAbortedError(f"{self.path}: the connection ended inside a chunked request body")
         return line
 
     def _send(self, request: Request, answer: Answer, fault: Fault | None) -> None:
-        with _opened(answer.body) as file:
+        with _open_body(answer.body) as file:
             size = os.fstat(file.fileno()).st_size if isinstance(answer.body, Path) else len(answer.body)
             if size:
                 size += fault.by if isinstance(fault, Long) else -fault.by if isinstance(fault, Short) else 0
@@ -185,13 +185,13 @@ class Handler(BaseHTTPRequestHandler):
                 return
 
 
-def _opened(body: bytes | Path) -> BinaryIO:
+def _open_body(body: bytes | Path) -> BinaryIO:
     return body.open("rb") if isinstance(body, Path) else io.BytesIO(body)
 
 
 @contextmanager
 def http_server(folder: Path, faults: Faults | None = None) -> Iterator[Server]:
-    """Serve the files of a folder; without listings, and nothing outside of the folder."""
+    """Serve the files of a folder, without listings of folders."""
     root = folder.resolve()
 
     def route(request: Request, body: bytes) -> Answer:

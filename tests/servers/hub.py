@@ -1,4 +1,4 @@
-"""A Hugging Face Hub on 127.0.0.1 for the real client: dataset repositories, by plain HTTP and LFS."""
+"""A simulated Hugging Face Hub on 127.0.0.1 for the real client: dataset repositories over HTTP and LFS."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from tests.servers.process import hub_environment, hub_settings
 
 
 class Hub(HubState):
-    """A running Hub: `endpoint`, `log`, `faults`, and `environment`, which directs another process to it.
+    """A running test Hub; the variables in `environment` direct another process to the Hub.
 
-    Large files are uploaded to and downloaded from a second port, the CDN, by their SHA-256; its requests are in the
-    same log as `/lfs/{sha256}` and `/cdn/{sha256}/{name}`, and meet the same faults.
+    A second port, the CDN, receives and serves large files by SHA-256. Requests to the CDN are in the same log, as
+    `/lfs/{sha256}` and `/cdn/{sha256}/{name}`, and the same faults apply.
 
     Args:
         root: empty folder for contents and for the client's caches.
@@ -38,7 +38,7 @@ class Hub(HubState):
         self.environment = hub_environment(self.endpoint, root / "home", self.token)
 
     def add_repo(self, id: str, folder: Path, tag: str | None = None) -> str:
-        """Make `main` of a repository, new or not, the files of a folder; return the commit's 40 hexadecimal digits."""
+        """Commit the files of a folder to `main` of a new or existing repository; return the commit's hash."""
         with self._lock:
             repo, files = self.repos.setdefault(id, Repo(id)), {}
             for path in folder.rglob("*"):
@@ -51,7 +51,7 @@ class Hub(HubState):
             return commit.oid
 
     def files(self, id: str, revision: str = "main") -> dict[str, bytes]:
-        """Path -> content of all files of a revision."""
+        """Return the contents of all files of a revision, by path."""
         with self._lock:
             files = self.repo(id).resolve(revision).files
             return {path: self.blobs.path(file.sha256).read_bytes() for path, file in files.items()}
@@ -81,7 +81,7 @@ class Hub(HubState):
             return Answer(b"no such object\n", 404)
         if request.method == "PUT":
             if hashlib.sha256(body).hexdigest() != sha256:
-                return Answer(b"the content does not have the SHA-256 it was announced with\n", 400)
+                return Answer(b"the content does not match the announced SHA-256\n", 400)
             with self._lock:
                 self.blobs.add(body, lfs=True)
             return Answer()
@@ -91,7 +91,7 @@ class Hub(HubState):
 
 @contextmanager
 def hub_server(root: Path) -> Iterator[Hub]:
-    """An empty Hub; meanwhile everything of huggingface_hub in this process talks to it.
+    """Run an empty test Hub, which all of huggingface_hub in this process uses meanwhile.
 
     Args:
         root: empty folder for contents and for the client's caches.

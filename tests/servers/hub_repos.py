@@ -1,4 +1,4 @@
-"""State of the test Hub: dataset repositories with their commits, and the contents of their files."""
+"""State of the test Hub: dataset repositories, their commits and the contents of files."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from tests.servers.http import Answer
 LFS_SUFFIXES = (".7z", ".arrow", ".bin", ".bz2", ".ckpt", ".gif", ".gz", ".h5", ".jpeg", ".jpg", ".mp4", ".msgpack")
 LFS_SUFFIXES += (".npy", ".npz", ".onnx", ".parquet", ".png", ".pt", ".pth", ".safetensors", ".tar", ".tgz", ".webp")
 LFS_SUFFIXES += (".xz", ".zip", ".zst")
-LFS_BYTES = 10 << 20  # from this size on a file is large whatever its suffix
+LFS_BYTES = 10 << 20  # files of at least this size are stored by LFS, whatever their suffix
 
 
 class Refusal(Exception):
-    """An error answer of the Hub.
+    """An error with which the test Hub answers a request.
 
     Args:
-        status: HTTP status.
-        message: text for people.
-        code: the Hub's name of the error, by which the client chooses the class of its exception.
-        headers: additional ones.
+        status: HTTP status of the answer.
+        message: text of the error.
+        code: the Hub's name of the error; the client chooses the class of its exception by this name.
+        headers: additional headers of the answer.
     """
 
     def __init__(self, status: int, message: str, code: str | None = None, headers: dict[str, str] | None = None):
@@ -39,13 +39,13 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class File:
-    """A file of a commit.
+    """A file in a commit of a repository.
 
     Args:
-        sha256: hash of the content.
-        size: bytes of the content.
-        oid: git's hash of what git stores: the content, or for a large file the pointer to it.
-        lfs: whether the file is large.
+        sha256: SHA-256 of the file's content.
+        size: number of bytes of the file's content.
+        oid: git's hash of the content, or of the LFS pointer if the file is stored by LFS.
+        lfs: whether the file is stored by LFS.
     """
 
     sha256: str
@@ -54,7 +54,7 @@ class File:
     lfs: bool
 
     def entry(self, path: str) -> dict:
-        """The file's entry in a tree listing."""
+        """Return the file's entry in a listing of the repository."""
         entry: dict = {"type": "file", "oid": self.oid, "size": self.size, "path": path}
         pointer = {"oid": self.sha256, "size": self.size, "pointerSize": len(_pointer(self.sha256, self.size))}
         return entry | ({"lfs": pointer} if self.lfs else {})
@@ -62,7 +62,7 @@ class File:
 
 @dataclass(frozen=True)
 class Commit:
-    """A version of a repository: its 40 hexadecimal digits, creation time, and path -> file."""
+    """A commit of a repository: its hash, its creation time, and its files by path."""
 
     oid: str
     date: str
@@ -71,7 +71,7 @@ class Commit:
 
 @dataclass
 class Repo:
-    """A dataset repository. Every commit stays readable by its 40 hexadecimal digits."""
+    """A dataset repository. Every commit stays readable by its hash."""
 
     id: str
     private: bool = False
@@ -80,14 +80,14 @@ class Repo:
     commits: dict[str, Commit] = field(default_factory=dict)
 
     def resolve(self, revision: str) -> Commit:
-        """The commit of a branch, a tag, or a commit's own digits."""
+        """Return the commit of a branch, a tag, or a commit's hash."""
         commit = self.commits.get(self.branches.get(revision) or self.tags.get(revision) or revision)
         if commit is None:
             raise Refusal(404, f"Invalid rev id: {revision}", "RevisionNotFound")
         return commit
 
     def commit(self, branch: str, files: Mapping[str, File]) -> Commit:
-        """Add a commit with exactly these files to a branch."""
+        """Add a commit that contains exactly the given files to a branch."""
         listed = {path: files[path] for path in sorted(files)}
         content = [self.id, {path: file.oid for path, file in listed.items()}, len(self.commits)]
         oid = hashlib.sha1(json.dumps(content).encode()).hexdigest()
@@ -98,32 +98,32 @@ class Repo:
 
 
 class Blobs:
-    """Contents of files by SHA-256, in a folder."""
+    """A folder that stores the contents of files by SHA-256."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
         root.mkdir(parents=True)
 
     def path(self, sha256: str) -> Path:
-        """Path of a content, which need not exist."""
+        """Return the path at which content with a SHA-256 is stored; the file may not exist."""
         return self._root / sha256
 
     def add(self, data: bytes, lfs: bool) -> File:
-        """Store a content."""
+        """Store the content of a file."""
         sha256 = hashlib.sha256(data).hexdigest()
-        if not self.path(sha256).exists():  # a client may be downloading it
+        if not self.path(sha256).exists():  # do not overwrite a file that a client may be downloading
             self.path(sha256).write_bytes(data)
         return self.file(sha256, lfs)
 
     def file(self, sha256: str, lfs: bool) -> File:
-        """The file with a stored content."""
+        """Return the commit's description of a file with stored content."""
         size = self.path(sha256).stat().st_size
         in_git = _pointer(sha256, size) if lfs else self.path(sha256).read_bytes()
         return File(sha256, size, hashlib.sha1(b"blob %d\0" % len(in_git) + in_git).hexdigest(), lfs)
 
 
 def is_large(path: str, size: int) -> bool:
-    """Whether the Hub stores a file outside git."""
+    """Return whether the Hub stores a file by LFS, outside git."""
     return size > 0 and (size >= LFS_BYTES or Path(path).suffix in LFS_SUFFIXES)
 
 
@@ -132,11 +132,11 @@ def _pointer(sha256: str, size: int) -> bytes:
 
 
 class HubState:
-    """Repositories and contents of a Hub, and the addresses of its two servers.
+    """Repositories and file contents of a test Hub, and the addresses of its two servers.
 
     Args:
-        root: empty folder for the contents.
-        token: the one that allows writing and reading private repositories.
+        root: empty folder to store contents of files in.
+        token: access token that allows writing, and reading private repositories.
     """
 
     def __init__(self, root: Path, token: str) -> None:
@@ -146,7 +146,7 @@ class HubState:
         self.endpoint = self.cdn = ""
 
     def repo(self, id: str) -> Repo:
-        """The repository <org>/<repo>."""
+        """Return the repository with the id <org>/<repo>."""
         if id not in self.repos:
             raise Refusal(404, "Repository not found", "RepoNotFound")
         return self.repos[id]

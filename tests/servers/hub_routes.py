@@ -1,4 +1,4 @@
-"""Requests that the test Hub answers for dataset repositories, one function each."""
+"""Functions that answer the requests to the test Hub, one function for each kind of request."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WEB = r"/datasets/(?P<id>[^/]+/[^/]+)"
 
 @dataclass(frozen=True)
 class Call:
-    """One request to the Hub: its state, the request, the names in the path by group, and the body."""
+    """A request to the test Hub: the Hub's state, the request, the parts of its path by name, and its body."""
 
     hub: HubState
     request: Request
@@ -30,12 +30,12 @@ class Call:
 
     @property
     def authorized(self) -> bool:
-        """Whether the request has the token."""
+        """Whether the request contains the access token."""
         return self.request.headers.get("Authorization") == f"Bearer {self.hub.token}"
 
     @property
     def repo(self) -> Repo:
-        """The repository in the path; a private one does not exist without the token."""
+        """The repository named in the path; requests without the token do not find private repositories."""
         repo = self.hub.repo(self.names["id"])
         if repo.private and not self.authorized:
             raise Refusal(401, "Repository not found", "RepoNotFound")
@@ -70,7 +70,7 @@ def info(call: Call) -> Answer:
 
 
 def tree(call: Call) -> Answer:
-    """All files and folders below a folder, the root by default; requests for one level are not needed here."""
+    """Answer with all files and folders below a folder, at all depths; the default is the root folder."""
     folder = f"{call.names['path']}/".lstrip("/")
     files = call.repo.resolve(call.names["revision"]).files
     found = {path: file.entry(path) for path, file in files.items() if path.startswith(folder)}
@@ -91,7 +91,7 @@ def refs(call: Call) -> Answer:
 
 
 def resolve(call: Call) -> Answer:
-    """A file's content; for a large one a redirect to the CDN."""
+    """Answer with the content of a file, or with a redirect to the CDN if the file is stored by LFS."""
     commit, path = call.repo.resolve(call.names["revision"]), call.names["path"]
     headers = {"X-Repo-Commit": commit.oid}
     if path not in commit.files:
@@ -123,7 +123,7 @@ def create(call: Call) -> Answer:
 
 
 def preupload(call: Call) -> Answer:
-    """For each announced file: whether to upload it to the CDN, and whether it is unchanged."""
+    """Answer for each announced file whether to upload it by LFS, and with the hash of the existing file."""
     call.require_token()
     commit, listed = call.repo.resolve(call.names["revision"]), []
     for announced in call.json()["files"]:
@@ -138,7 +138,7 @@ def preupload(call: Call) -> Answer:
 
 
 def lfs_batch(call: Call) -> Answer:
-    """Upload addresses of large files; none for a content that the CDN has."""
+    """Answer with upload addresses for those large files whose content the CDN does not have."""
     call.require_token()
     objects = []
     for announced in call.json()["objects"]:
@@ -166,14 +166,14 @@ def commit(call: Call) -> Answer:
 
 
 def _apply(hub: HubState, files: dict[str, File], key: str, value: dict) -> None:
-    """Change the files of a commit by one operation."""
+    """Apply one operation of a commit request (add or delete a file) to the files of a commit."""
     path = value["path"].strip("/")
     if key == "file":
         content = base64.b64decode(value["content"], validate=True)
         files[path] = hub.blobs.add(content, lfs=False)
     elif key == "lfsFile":
         if not hub.blobs.path(value["oid"]).exists():
-            raise Refusal(400, f"{path}: its content {value['oid']} was not uploaded")
+            raise Refusal(400, f"{path}: the content {value['oid']} was not uploaded")
         files[path] = hub.blobs.file(value["oid"], lfs=True)
     elif key == "deletedFile" and path in files:
         del files[path]
@@ -191,7 +191,7 @@ def new_tag(call: Call) -> Answer:
 
 
 def validate_yaml(call: Call) -> Answer:
-    """The Hub's answer to a valid card; what the tests upload is not validated."""
+    """Answer as the Hub does to a valid dataset card, without checking the card."""
     return answer({"errors": [], "warnings": []})
 
 
@@ -208,4 +208,4 @@ ROUTES: list[tuple[str, str, Route]] = [
     ("POST", rf"{WEB}\.git/info/lfs/objects/batch", lfs_batch),
     ("GET HEAD", f"{WEB}/resolve{AT}/(?P<path>.+)", resolve),
 ]
-"""Methods, pattern of the path, route."""
+"""HTTP methods, pattern of the path, and function that answers, for each kind of request."""

@@ -1,4 +1,4 @@
-"""State that clients keep in this process: the environment, fsspec's instances, huggingface_hub's constants."""
+"""Set environment variables, and huggingface_hub's constants in this process, for the duration of a test."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from huggingface_hub.utils import _http
 MISSING = object()
 
 uploads = pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning")
-"""For a test in whose process huggingface_hub 2.4 uploads by LFS: it calls httpx2 in a way that httpx2 warns of."""
+"""Mark for tests that upload by LFS: huggingface_hub 2.4 passes httpx2 an argument that httpx2 warns about."""
 
 
 @contextmanager
 def environment(changes: Mapping[str, str | None]) -> Iterator[None]:
-    """Set variables for a while; None removes one."""
+    """Set environment variables for a while; the value None removes a variable."""
     before = {name: os.environ.get(name) for name in changes}
     try:
         _set(changes)
@@ -39,7 +39,7 @@ def _set(changes: Mapping[str, str | None]) -> None:
 
 
 def hub_environment(endpoint: str, home: Path, token: str) -> dict[str, str]:
-    """Variables that direct another process to a Hub. Xet is disabled, which the client would use for uploads."""
+    """Return environment variables that direct a process to the test Hub and make it upload by LFS, not by Xet."""
     return {
         "HF_ENDPOINT": endpoint,
         "HF_HOME": str(home),
@@ -59,22 +59,22 @@ REMOVED += ("HF_OIDC_RESOURCE", "HF_HUB_DISABLE_IMPLICIT_TOKEN", "HUGGINGFACE_CO
 def hub_settings(variables: Mapping[str, str]) -> Iterator[None]:
     """Apply `hub_environment` to a process that has already imported huggingface_hub.
 
-    The client's constants are replaced in every module that has copied them, and the endpoint of the API object that it
-    makes on import; its HTTP session is closed on the way in and out.
+    This replaces the client's constants in every module that has copied them, and the endpoint of the API object that
+    the client makes on import. The client's HTTP session is closed before and after.
     """
-    changes, before = _changes(variables), constants.ENDPOINT
+    changes, before = _changed_constants(variables), constants.ENDPOINT
     with environment({**variables, **dict.fromkeys(REMOVED)}):
         try:
-            _replace(changes)
-            _restart(variables["HF_ENDPOINT"])
+            _replace_constants(changes)
+            _reset_client(variables["HF_ENDPOINT"])
             yield
         finally:
-            _replace({name: (new, old) for name, (old, new) in changes.items()})
-            _restart(before)
+            _replace_constants({name: (new, old) for name, (old, new) in changes.items()})
+            _reset_client(before)
 
 
-def _changes(variables: Mapping[str, str]) -> dict[str, tuple[Any, Any]]:
-    """Name -> (old value, new value) of the client's constants."""
+def _changed_constants(variables: Mapping[str, str]) -> dict[str, tuple[Any, Any]]:
+    """Return the old and the new value of each constant of huggingface_hub to change, by name."""
     endpoint, home = variables["HF_ENDPOINT"], variables["HF_HOME"]
     values = {
         "ENDPOINT": endpoint,
@@ -96,7 +96,7 @@ def _changes(variables: Mapping[str, str]) -> dict[str, tuple[Any, Any]]:
     return {name: (getattr(constants, name), value) for name, value in values.items()} | {"_HUB_ORIGINS": origins}
 
 
-def _replace(changes: Mapping[str, tuple[Any, Any]]) -> None:
+def _replace_constants(changes: Mapping[str, tuple[Any, Any]]) -> None:
     for name, module in list(sys.modules.items()):
         if name.split(".")[0] == "huggingface_hub":
             for constant, (old, new) in changes.items():
@@ -104,7 +104,7 @@ def _replace(changes: Mapping[str, tuple[Any, Any]]) -> None:
                     vars(module)[constant] = new
 
 
-def _restart(endpoint: str) -> None:
+def _reset_client(endpoint: str) -> None:
     hf_api.api.endpoint = endpoint
     hf_api.api._whoami_cache.clear()
     huggingface_hub.close_session()

@@ -1,4 +1,4 @@
-"""A bucket on 127.0.0.1."""
+"""A simulated S3 bucket on 127.0.0.1."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.servers.process import environment
 
 @contextmanager
 def s3_server(folder: Path, bucket: str = "data") -> Iterator[str]:
-    """A bucket with the files of a folder, which fsspec finds without options; yields its address."""
+    """Serve the files of a folder from an S3 bucket, which fsspec finds without options; yield the bucket's address."""
     logging.getLogger("werkzeug").setLevel(logging.ERROR)  # moto logs every request
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
@@ -30,7 +30,7 @@ def s3_server(folder: Path, bucket: str = "data") -> Iterator[str]:
         "AWS_EC2_METADATA_DISABLED": "true",
     }
     try:
-        # A profile or a session of the user's own would be preferred to the keys above.
+        # The user's AWS profile or session token would take precedence over the keys above.
         with environment({**variables, "AWS_PROFILE": None, "AWS_SESSION_TOKEN": None}):
             client = boto3.Session().client("s3")
             client.create_bucket(Bucket=bucket)
@@ -43,7 +43,7 @@ def s3_server(folder: Path, bucket: str = "data") -> Iterator[str]:
             finally:
                 client.close()
     finally:
-        # moto's buckets belong to the process, not to its server.
+        # moto keeps buckets after its server has stopped, so they are deleted here.
         with urllib.request.urlopen(urllib.request.Request(f"{endpoint}/moto-api/reset", method="POST")):
             pass
         server.stop()

@@ -1,4 +1,4 @@
-"""Bundled models: copied from runs, loaded by name and listed."""
+"""Bundled models: copied from training runs, loaded by name and listed by the command `models`."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def run(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def models(run, tmp_path, monkeypatch) -> Path:
-    """A folder of bundled models in place of the package's, with one model of one track."""
+    """Replace the package's bundled models by a folder with one model of one track."""
     bundle_run(run, "ad-tiny", "teammate", tmp_path)
     monkeypatch.setattr(bundled.bundled_models, "__defaults__", (tmp_path,))
     return tmp_path
 
 
-def test_bundling_copies_the_parameters_of_the_run(run, models):
+def test_bundling_copies_parameters_and_training_record_of_the_run(run, models):
     one, two = read_trained(run), read_trained(models / "ad-tiny" / "teammate")
     jax.tree.map(np.testing.assert_array_equal, one.params, two.params)
     assert (one.step, one.context, one.layouts, one.trained_on) == (two.step, two.context, two.layouts, two.trained_on)
@@ -55,13 +55,13 @@ def test_bundling_copies_the_parameters_of_the_run(run, models):
         assert copied.size == drawn.size and copied.mode == "P"
 
 
-def test_a_bundled_model_has_a_name_and_its_training_record(run, models):
+def test_bundled_model_reports_its_name_and_training_record(run, models):
     agent = find_agent("ad-tiny")
     assert agent.details and agent.name == agent.details["model"] == "ad-tiny"
     assert agent.details["trained_on"] == {"teammate": read_trained(run).trained_on}
 
 
-def test_a_bundled_model_keeps_its_play_mode(run, tmp_path, monkeypatch):
+def test_model_bundled_as_sampled_samples_actions_by_default(run, tmp_path, monkeypatch):
     bundle_run(run, "ad-drawn", "teammate", tmp_path, sampled=True)
     monkeypatch.setattr(bundled.bundled_models, "__defaults__", (tmp_path,))
     by_default, greedy = find_agent("ad-drawn"), find_agent("ad-drawn", greedy=True)
@@ -75,13 +75,13 @@ def test_a_bundled_model_keeps_its_play_mode(run, tmp_path, monkeypatch):
         find_agent(run, acting="exat")  # type: ignore[arg-type]
 
 
-def test_layouts_outside_the_track_are_refused(models):
+def test_layout_of_a_track_without_bundled_model_raises_error(models):
     message = "ad-tiny: no model for layout cramped_down of track layout, only for tracks teammate: choose tasks"
     with pytest.raises(OptionError, match=message):
         find_agent("ad-tiny").make(get_layout("cramped_down"))
 
 
-def test_names_and_unfinished_runs(run, tmp_path):
+def test_bundling_rejects_invalid_names_and_unfinished_runs(run, tmp_path):
     for name in ("../ad", "oracle", "AD-x", ""):
         with pytest.raises(OptionError, match="expected words of small letters and digits with hyphens: ad-reference"):
             bundle_run(run, name, "teammate", tmp_path)
@@ -94,14 +94,14 @@ def test_names_and_unfinished_runs(run, tmp_path):
     assert not (tmp_path / "models").exists()
 
 
-def test_large_models_are_refused(run, tmp_path, monkeypatch):
+def test_bundling_rejects_large_models(run, tmp_path, monkeypatch):
     monkeypatch.setattr(bundled, "_LARGEST", 1000)
     with pytest.raises(OptionError, match=r"parameters of [\d,]+ bytes, expected at most 1,000: bundle a smaller"):
         bundle_run(run, "ad-tiny", "teammate", tmp_path)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_package_bundles_models_that_play_and_have_cards():
+def test_models_of_the_package_are_small_have_cards_and_load():
     assert set(bundled_models(MODELS)) == {"ad-reference", "ad-rising", "dpt-reference", "rl2-reference"}
     scores = describe_scores(read_stored(results_file()), bundled_models(MODELS))
     for model in bundled_models(MODELS).values():
@@ -118,7 +118,7 @@ def test_the_package_bundles_models_that_play_and_have_cards():
                 assert policy.sees == "canonical_input" and trained.channels == "canonical"
 
 
-def test_parameters_of_another_model_are_refused(run, tmp_path):
+def test_training_rejects_initial_parameters_of_another_model_size(run, tmp_path):
     out = str(tmp_path / "out")
     arguments = ["train", "ad", "--layout", "demo_wide", "--channels", "canonical", "--out", out, "--init", str(run)]
     small = ["--steps", "1", "--batch-size", "2", "--context", "6", "--heads", "2", "--dropout", "0.1"]
@@ -127,7 +127,7 @@ def test_parameters_of_another_model_are_refused(run, tmp_path):
     assert not Path(out).exists()
 
 
-def test_models_command(models):
+def test_models_command_lists_bundled_models(models):
     printed = run_cli("models")
     assert re.search(r"^ad-tiny: ; N – on track teammate, N – on track layout, M –; of 20\d\d-\d\d-\d\d\n", printed)
     assert "\n  track teammate: AD+mlp, " in printed

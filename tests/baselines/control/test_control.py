@@ -1,4 +1,4 @@
-"""The positive control: small environments, sources of histories and checks."""
+"""The positive control of in-context learning: small environments, learning algorithms and checks."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from tests.helpers.commands import run_cli
 TINY = control.ControlSize(bandit_steps=4, room_episodes=2, rows=64, tasks=4, updates=(2, 2, 2), batch_size=4)
 
 
-def fixed(action: int) -> Policy:
+def always(action: int) -> Policy:
     return Policy((), lambda params, key: (), lambda params, carry, view, key: (jnp.int32(action), carry), "ego_input")
 
 
-def test_rewards_of_the_small_environments():
+def test_bandit_and_dark_room_give_expected_rewards():
     means = jnp.array([[0.0, 1.0, 0, 0, 0], [1.0, 0.0, 0, 0, 0]])
-    actions, rewards = worlds.play_world(worlds.bandit(), fixed(1), means, 0, 6)
+    actions, rewards = worlds.play_world(worlds.bandit(), always(1), means, 0, 6)
     assert actions.tolist() == [[1] * 6] * 2
     assert rewards.tolist() == [[1] * 6, [0] * 6]
     above, corner = worlds.MIDDLE - worlds.SIDE, 0
-    _, rewards = worlds.play_world(worlds.dark_room(), fixed(0), jnp.array([above, corner]), 0, 2 * worlds.ROOM_STEPS)
-    episode = [1] + [0] * (worlds.ROOM_STEPS - 1)  # the agent passes the goal and stops at the wall
+    _, rewards = worlds.play_world(worlds.dark_room(), always(0), jnp.array([above, corner]), 0, 2 * worlds.ROOM_STEPS)
+    episode = [1] + [0] * (worlds.ROOM_STEPS - 1)  # the agent moves up past the goal to the wall
     assert rewards.tolist() == [episode * 2, [0] * 2 * worlds.ROOM_STEPS]
     assert worlds.best_return(np.array([above, corner])).tolist() == [10, 7]
 
 
-def test_sources_learn():
+def test_source_algorithms_improve_within_a_history():
     rng = np.random.default_rng(0)
     means = rng.random((300, worlds.ARMS))
     uniform = 100 * (means.max(axis=1) - means.mean(axis=1)).mean()
@@ -48,7 +48,7 @@ def test_sources_learn():
 @pytest.mark.parametrize(
     ("quantity", "code"), [("regret, at most", 0), ("regret, at least", 1), ("gain, at most", 0), ("gain, at least", 1)]
 )
-def test_the_command_fails_if_a_check_fails(tmp_path, monkeypatch, quantity, code):
+def test_control_command_exits_with_1_if_a_check_fails(tmp_path, monkeypatch, quantity, code):
     check = control.ControlCheck("bandits", "AD", quantity, 1.0, 2.0, "")
     monkeypatch.setattr(control, "run_control", lambda folder, done: [check])
     printed = run_cli("control", "--out", tmp_path, code=code)
@@ -56,11 +56,11 @@ def test_the_command_fails_if_a_check_fails(tmp_path, monkeypatch, quantity, cod
 
 
 @pytest.mark.slow
-def test_a_tiny_control_runs_and_fails(tmp_path, monkeypatch):
+def test_tiny_control_trains_all_models_and_fails_checks(tmp_path, monkeypatch):
     monkeypatch.setattr(control.run_control, "__defaults__", (TINY, lambda name, total, step, loss: None))
     printed = run_cli("control", "--out", tmp_path, code=1)
     assert printed.count("FAIL") >= 2
-    # A model without its context cannot have twice the regret of the algorithm within four steps.
+    # Four steps are too few for a model without context to have twice the regret of the source algorithm.
     assert "FAIL  bandits    AD, context cut off" in printed
     parts = {path.name for path in tmp_path.iterdir() if path.is_dir()}
     assert parts == {"dpt_on_bandits", "ad_on_bandits", "ad_in_dark_room"}

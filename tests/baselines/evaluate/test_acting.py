@@ -1,4 +1,4 @@
-"""Trained models as egos of the evaluator, and the commands that train and evaluate them."""
+"""Evaluation of trained models, and the commands `train` and `evaluate`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ OPTIONS = TrainOptions(steps=2, batch_size=2, context=30)
 
 @pytest.fixture(scope="module")
 def runs(lite, tmp_path_factory) -> Path:
-    """Return run folders of two untrained models, `ad` and `dpt`."""
+    """Return a folder with run folders `ad` and `dpt` of two models with random parameters."""
     folder = tmp_path_factory.mktemp("runs")
     for name in ("ad", "dpt"):
         job = prepare(name, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(lite[0])))
@@ -43,7 +43,7 @@ def runs(lite, tmp_path_factory) -> Path:
     return folder
 
 
-def test_the_evaluator_plays_trained_models(runs, tmp_path):
+def test_evaluation_of_a_trained_model_stores_settings_of_its_run(runs, tmp_path):
     agent = find_agent(runs / "dpt", acting="cached")
     assert agent.name == "DPT+TA"
     (result,) = evaluate(agent.name, agent.make, WIDE[:1], SHORT, details=agent.details, out=tmp_path)
@@ -57,12 +57,12 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path):
 
 
 class TestBadRuns:
-    def test_a_layout_that_does_not_fit(self, runs, tmp_path):
+    def test_evaluation_on_layout_of_another_shape_raises_error(self, runs, tmp_path):
         arguments = ["evaluate", "--agent", str(runs / "ad"), "--layout", "coord_simple", "--out", str(tmp_path)]
         with pytest.raises(OptionError, match=r"trained on demo_wide with observations \(5, 5, 45\); coord_simple has"):
             run_cli(*arguments)
 
-    def test_another_version_and_another_shape(self, runs, tmp_path):
+    def test_damaged_or_incompatible_run_raises_error(self, runs, tmp_path):
         def copy(name: str, **changes) -> str:
             shutil.copytree(runs / "ad", tmp_path / name)
             config = json.loads((tmp_path / name / "config.json").read_text())
@@ -84,8 +84,8 @@ class TestBadRuns:
 
 
 @pytest.mark.slow
-def test_the_train_command(lite, tmp_path, monkeypatch):
-    """Train on a release that is opened by its address."""
+def test_train_command_records_settings_and_data(lite, tmp_path, monkeypatch):
+    """The release is read from an HTTP address."""
     monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 16, 5, heads=2, encoder="words"))
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     small = ["--steps", "1", "--batch-size", "2", "--context", "4"]

@@ -1,4 +1,4 @@
-"""Models trained with canonical channels on several layouts and evaluated on a layout of another shape."""
+"""Models trained with canonical channels on several layouts, and evaluated on a layout with other channels."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=1, steps=5)
 MODEL = ModelOptions(layers=1, width=8, heads=2)
 OPTIONS = TrainOptions(steps=1, batch_size=2, context=6)
 THIRD = get_layout("cramped_down")
-"""A layout of 35 channels; the training layouts have 40 and 45."""
+"""A layout whose observations have 35 channels; the training layouts have 40 and 45 channels."""
 
 
 @pytest.fixture(scope="module")
 def trained(lite, tmp_path_factory) -> tuple[Path, str]:
-    """Train on all layouts of a release; return the run folder and the output."""
+    """Train on all layouts of a release; return the run folder and the printed output."""
     out = tmp_path_factory.mktemp("canonical") / "run"
     sizes = ["--steps", "1", "--batch-size", "4", "--context", "6", "--layers", "1", "--width", "8", "--heads", "2"]
     arguments = ["train", "ad", "--layout", "all", "--root", str(lite[0]), "--out", str(out)]
@@ -50,7 +50,7 @@ def trained(lite, tmp_path_factory) -> tuple[Path, str]:
     return out, printed
 
 
-def test_the_run(trained):
+def test_training_on_all_layouts_uses_canonical_channels(trained):
     folder, printed = trained
     summary = "training on coord_simple, demo_wide; canonical channels, observations of 5 x 5 x 46"
     assert summary in printed
@@ -61,7 +61,7 @@ def test_the_run(trained):
     assert (run.channels, run.obs_shape, run.layouts) == ("canonical", (5, 5, 46), ("coord_simple", "demo_wide"))
 
 
-def test_evaluation_on_an_untrained_layout(trained, tmp_path):
+def test_model_is_evaluated_on_a_layout_without_training_data(trained, tmp_path):
     folder, _ = trained
     agent = find_agent(str(folder))
     task = published_task(THIRD.name, "H4/t0")
@@ -73,8 +73,8 @@ def test_evaluation_on_an_untrained_layout(trained, tmp_path):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_jax_egos_get_canonical_channels_on_every_layout(layout):
-    """The policy returns its observation instead of an action."""
+def test_jax_egos_receive_canonical_channels_on_every_layout(layout):
+    """Compare observations by a policy that returns its input instead of an action."""
     shown = Policy((), lambda params, key: (), lambda params, memory, ego_input, key: (ego_input, memory), "ego_input")
     (record,), key = random_records(layout, 1, np.random.default_rng(4)), jax.random.split(jax.random.key(0), 1)
     zero = jnp.zeros(1, jnp.int32)
@@ -87,7 +87,7 @@ def test_jax_egos_get_canonical_channels_on_every_layout(layout):
         assert seen._replace(obs=0) == before._replace(obs=0)
 
 
-def test_host_egos_get_canonical_channels():
+def test_host_agents_receive_canonical_channels():
     class Agent:
         def reset(self, batch: int) -> None:
             self.batch = batch
@@ -109,8 +109,8 @@ def test_host_egos_get_canonical_channels():
         from_host(agent, "union")  # type: ignore[arg-type]
 
 
-def test_each_split_is_rendered_with_its_layouts(lite):
-    """The validation part contains only the second layout; batches still use the model's layout numbers."""
+def test_training_and_validation_batches_are_rendered_with_correct_layouts(lite):
+    """The validation part contains only the second layout, but its batches use the model's layout numbers."""
     job = prepare("ad", MODEL, dataclasses.replace(OPTIONS, batch_size=8), HistoryOptions(("all",), str(lite[0])))
     names = job.about["histories"]["layouts"]
     view = CompactView("paper", tuple(map(get_layout, names)), canonical=True)
@@ -134,12 +134,12 @@ def test_each_split_is_rendered_with_its_layouts(lite):
         (("all",), None, "canonical", 46),
     ],
 )
-def test_default_channels(lite, layouts, given, channels, size):
+def test_canonical_channels_are_default_for_several_layouts(lite, layouts, given, channels, size):
     about = prepare("ad", MODEL, OPTIONS, HistoryOptions(layouts, str(lite[0]), channels=given)).about["histories"]
     assert (about["channels"], about["obs_shape"]) == (channels, [5, 5, size])
 
 
-def test_all_layouts_means_those_that_pass_the_filters(lite, tmp_path):
+def test_layouts_all_selects_every_layout_of_the_release(lite, tmp_path):
     random_release(tmp_path, layouts=("asymm_both", "cramped_up"), teammates=1)
     about = prepare("ad", MODEL, OPTIONS, HistoryOptions(("all",), str(tmp_path))).about["histories"]
     assert (about["layouts"], about["channels"]) == (["asymm_both", "cramped_up"], "canonical"), "of one shape, 35"

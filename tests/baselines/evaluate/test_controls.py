@@ -1,4 +1,4 @@
-"""Controls of memory and partner, and the protocol `swap`, with an ego whose returns follow from its memory."""
+"""Memory and partner controls and the protocol `swap`, tested with an ego that acts by its memory."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from tests.helpers.commands import run_cli
 
 H1, H2, H4 = (published_task("coord_simple", f"{family}/t0") for family in ("H1", "H2", "H4"))
 TASKS = [H1, H4]
-"""Two tasks of which H4 delivers alone, and H1 never does: egos that stay earn 40 and 0 in an episode."""
+"""Two tasks: H1 never delivers and H4 delivers without help, so the ego `stay` earns 0 and 40 in an episode."""
 FOUR = dataclasses.replace(PROTOCOLS["seeded"], episodes=4)
 STAYS, RANDOM, PAID = 0, 1, 2
 
 
 class Remembered(NamedTuple):
-    """Number of finished episodes, reward in the first one, and whether the ego acts randomly in this one."""
+    """Number of finished episodes, reward in the first episode, and whether the ego acts randomly in this episode."""
 
     episodes: jax.Array
     paid: jax.Array
@@ -54,20 +54,20 @@ def _act(mode, memory, ego_input, key):
 
 
 def ego(mode):
-    """Stays or acts randomly; in mode PAID stays in the first episode, and later if the first one was paid."""
+    """Return an ego that stays, acts randomly, or (PAID) acts randomly only after a first episode without reward."""
     policy = Policy(jnp.int32(mode), _begin, _act, "ego_input")
     return lambda layout: policy
 
 
 @pytest.fixture(scope="module")
 def programs():
-    """Compiled programs that all tests of this module share."""
+    """Cache of compiled programs that all tests of this module share."""
     return Programs()
 
 
 @pytest.fixture(scope="module")
-def alone(programs):
-    """Returns (tasks, episodes) of the egos that stay and that act randomly."""
+def solo_returns(programs):
+    """Returns (tasks, episodes) of the ego that stays and of the ego that acts randomly."""
 
     def play(mode):
         results = evaluate("fixed", ego(mode), TASKS, FOUR, programs=programs)
@@ -76,16 +76,16 @@ def alone(programs):
     return play(STAYS), play(RANDOM)
 
 
-def test_memory_and_partner_are_exact(alone, programs, tmp_path):
-    stays, wanders = alone
+def test_memory_and_partner_controls_equal_hand_computed_differences(solo_returns, programs, tmp_path):
+    stays, wanders = solo_returns
     assert stays.tolist() == [[0] * 4, [40] * 4]
     assert (wanders < stays)[:, 1:].any(axis=1).all()
     found = evaluate_controls("mine", ego(PAID), TASKS, FOUR, out=tmp_path, programs=programs)
-    assert len(programs) == 2  # one for each family of teammates
+    assert len(programs) == 2  # one program for each teammate family
     plain = np.array([[stays[0, 0], *wanders[0, 1:]], stays[1]])
     np.testing.assert_array_equal([result.returns[0] for result in found.plain], plain)
     np.testing.assert_array_equal([result.returns[0] for result in found.cleared], stays)
-    # After H4, which pays, the ego stays with H1; after H1, which does not, it acts randomly with H4.
+    # The ego stays with H1 after reward with H4, and acts randomly with H4 after no reward with H1.
     swapped = np.array([result.returns[0] for result in found.swapped])
     np.testing.assert_array_equal(swapped[:, 2:], [stays[0, 2:], wanders[1, 2:]])
     np.testing.assert_array_equal(found.memory[:, 0], (plain - stays).mean(axis=1))
@@ -97,8 +97,8 @@ def test_memory_and_partner_are_exact(alone, programs, tmp_path):
     assert f"track teammate, partner P: {found.partner.mean():+.1f}, return in the 2 last episodes" in partner
 
 
-def test_intervals_of_controls_resample_behaviours():
-    """Five tasks of H4 on one layout are one behaviour: with one seed there is nothing to resample."""
+def test_control_intervals_treat_equal_behaviours_as_one_unit():
+    """The five H4 teammates of one layout behave the same: one seed gives no interval, unlike for H3."""
     tasks = [task for task in published_tasks("teammate") if task.layout.name == "coord_simple"]
     values = np.arange(4.0)
     for family in ("H4", "H3"):
@@ -111,33 +111,33 @@ def test_intervals_of_controls_resample_behaviours():
         assert memory.startswith("track teammate, memory M: +2.0") and ("(" in memory) == (family == "H3")
 
 
-def test_controls_of_an_ego_without_memory_earn_the_same(alone, programs):
-    """The last episodes have the same keys whoever played before."""
+def test_controls_do_not_change_returns_of_ego_without_memory(solo_returns, programs):
+    """The random keys of the last episodes do not depend on the teammates of earlier episodes."""
     found = evaluate_controls("random", ego(RANDOM), TASKS, FOUR, programs=programs)
-    np.testing.assert_array_equal([result.returns[0] for result in found.plain], alone[1])
+    np.testing.assert_array_equal([result.returns[0] for result in found.plain], solo_returns[1])
     assert not found.memory.any() and not found.partner.any()
     first, swapped = ([result.returns[0][:2] for result in results] for results in (found.plain, found.swapped))
     assert first != swapped
 
 
-def test_swap_keeps_the_memory_and_the_keys(alone, programs):
+def test_protocol_swap_keeps_ego_memory_and_random_keys(solo_returns, programs):
     rules = dataclasses.replace(PROTOCOLS["swap"], episodes=4, swap_every=2)
     first, second = evaluate("mine", ego(PAID), TASKS, rules, programs=programs)
-    stays, wanders = alone
+    stays, wanders = solo_returns
     assert first.returns[0][:2] == [stays[0, 0], wanders[0, 1]]
-    assert second.returns[0] == [40, 40, 0, 0]  # H4 paid
+    assert second.returns[0] == [40, 40, 0, 0]  # the ego stays, since H4 gave reward in the first episode
     other = dataclasses.replace(H1, teammate=H4.teammate)
     (expected,) = evaluate("fixed", ego(RANDOM), [other], FOUR)
     assert first.returns[0][2:] == expected.returns[0][2:]
     assert (first.partners, second.partners) == ([H1.task_id, H4.task_id], [H4.task_id, H1.task_id])
 
 
-def test_results_are_found_again(programs, tmp_path):
-    """A control's folder is resumed with the same partners only; plain results keep the settings of old ones."""
+def test_stored_control_results_are_reused_only_for_same_partners(programs, tmp_path):
+    """A folder of a control is resumed only with the same partners; results without a control store no partners."""
     first = evaluate_controls("mine", ego(PAID), TASKS, FOUR, out=tmp_path, details={"of": 1}, programs=programs)
 
     def never(layout):
-        raise AssertionError("plays again")
+        raise AssertionError("finished tasks are evaluated again")
 
     assert evaluate_controls("mine", never, TASKS, FOUR, out=tmp_path, details={"of": 1}) == first
     plain, cleared, swapped = (results[0].settings for results in first[:3])
@@ -153,7 +153,7 @@ def test_results_are_found_again(programs, tmp_path):
 
 
 class Recorder:
-    """A host agent that stays, counts its resets, and records what it sees in the first step of each episode."""
+    """A host agent that stays, and records its resets and its inputs in the first step of each episode."""
 
     def __init__(self):
         self.log: list[list] = []
@@ -169,22 +169,22 @@ class Recorder:
         return np.full(len(ego_input.obs), STAY)
 
 
-def test_host_agents_are_reset_before_each_episode(tmp_path):
+def test_memory_control_resets_host_agents_before_each_episode(tmp_path):
     agent, short = Recorder(), dataclasses.replace(FOUR, steps=5)
     evaluate_controls("host", from_host(agent), TASKS, short)
-    # Two teammate families: both play plainly, then with 4 resets each, then swapped.
+    # Both families: one reset without a control, four resets with memory cleared, one reset with swapped teammates.
     assert [len(episodes) for episodes in agent.log] == [4, 4] + [1] * 8 + [4, 4]
     plain, cleared, swapped = agent.log[0], [episodes[0] for episodes in agent.log[2:6]], agent.log[10]
     assert [bool(one.prev_done) for one in plain] == [False, True, True, True]
     assert not any(one.prev_done or one.prev_action for one in cleared)
     assert [bool(one.prev_done) for one in swapped] == [False, True, True, True]
-    for one, other, third in zip(plain, cleared, swapped, strict=True):  # the same starts
+    for one, other, third in zip(plain, cleared, swapped, strict=True):  # all have the same start states
         np.testing.assert_array_equal(one.obs, other.obs)
         np.testing.assert_array_equal(one.obs, third.obs)
 
 
-class TestPlan:
-    def test_partners_are_the_next_of_another_family(self):
+class TestPlanTasks:
+    def test_swap_partner_is_from_the_next_teammate_family(self):
         tasks = [task for task in published_tasks("teammate") if task.layout.name in ("coord_simple", "demo_wide")]
         by_id = {task.task_id: task for task in tasks}
         after = {"H1": "H2", "H2": "H3", "H3": "H4", "H4": "H1"}
@@ -197,13 +197,13 @@ class TestPlan:
         families = [by_id[partner].teammate_family for partner in plan_tasks(tasks, PROTOCOLS["swap"])[0].partners]
         assert families == ["H1", "H2", "H3", "H4"]
 
-    def test_of_one_family_another_teammate_plays(self):
+    def test_swap_partner_within_one_family_is_another_teammate(self):
         first, second = (published_task("coord_simple", f"H4/t{number}") for number in range(2))
         again = dataclasses.replace(first, task_id="again")
         partners = {task.task_id: ids[0] for task, _, ids in plan_tasks([first, again, second], FOUR, "swapped")}
         assert partners == {first.task_id: second.task_id, "again": second.task_id, second.task_id: first.task_id}
 
-    def test_tasks_with_recipes_want_another_dish_before(self):
+    def test_swap_partner_has_another_recipe(self):
         dishes = [[(0, 0, 0)], [(0, 0, 0)], [(1, 1, 1)]]
         tasks = [
             make_task("teammate", "test", "coord_simple", one.teammate, 0, dish)
@@ -213,7 +213,7 @@ class TestPlan:
         assert plan.partners[0] == tasks[2].task_id
         assert [one.recipes for one in plan.played] == [((1, 1, 1),), ((0, 0, 0),)]
 
-    def test_segments(self):
+    def test_segment_lengths_add_up_to_episodes_of_the_protocol(self):
         assert segment_lengths(PROTOCOLS["seeded"]) == (100,)
         assert segment_lengths(PROTOCOLS["swap"]) == (25, 25, 25, 25)
         assert segment_lengths(get_protocol("swap", 30)) == (25, 5)
@@ -221,7 +221,7 @@ class TestPlan:
         assert segment_lengths(get_protocol("seeded", 39), "swapped") == (20, 19)
         assert segment_lengths(get_protocol("seeded", 3), "swapped") == (2, 1)
 
-    def test_a_task_without_partner_is_named(self):
+    def test_task_without_swap_partner_raises_error_with_its_id(self):
         message = rf"task {H1.task_id}: expected another task on coord_simple with another teammate to swap with, found"
         with pytest.raises(OptionError, match=message):
             plan_tasks([H1, published_task("demo_wide", "H2/t0")], FOUR, "swapped")
@@ -229,7 +229,7 @@ class TestPlan:
             evaluate("stay", stay, [H1], "swap")
         assert plan_tasks([H1], get_protocol("swap", 25))[0].partners == ()
 
-    def test_refusals(self):
+    def test_controls_reject_unsuitable_protocols_and_unknown_names(self):
         for rules in (PROTOCOLS["swap"], get_protocol("seeded", 1)):
             with pytest.raises(OptionError, match=f"protocol {rules.name} and episodes = {rules.episodes}: expected"):
                 evaluate_controls("stay", stay, TASKS, rules)
@@ -239,8 +239,8 @@ class TestPlan:
             next(play_tasks(stay, [H4], PROTOCOLS["swap"]))
 
 
-def test_the_next_segment_starts_on_its_own_layouts():
-    """A teammate's dish takes effect at its first episode, whose state was drawn with the dish of the one before."""
+def test_next_segment_starts_with_its_own_recipes():
+    """The first state of a segment is drawn with the previous recipe; `enter` replaces this by the new recipe."""
     first, second = (
         [make_task("teammate", "test", "coord_simple", H4.teammate, seed, [dish]) for seed in range(2)]
         for dish in ((0, 0, 0), (1, 1, 1))
@@ -258,7 +258,7 @@ def test_the_next_segment_starts_on_its_own_layouts():
     assert not np.array_equal(state.env.record[0], before.env.record[0])
 
 
-def test_controls_command(programs, tmp_path, monkeypatch):
+def test_evaluate_command_with_controls_writes_all_results(programs, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "icrl4aht_baselines.commands.train_commands.find_ego", lambda option, name, **mode: NamedEgo(name, ego(PAID))
     )

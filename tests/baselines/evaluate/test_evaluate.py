@@ -1,4 +1,4 @@
-"""The evaluator: results depend only on the task; inputs of egos, stored results and error messages."""
+"""The evaluator: results that depend only on the task, inputs of egos, stored results and error messages."""
 
 from __future__ import annotations
 
@@ -44,20 +44,20 @@ def returns(results):
 
 
 @pytest.fixture(scope="module")
-def together():
-    """Returns of ten tasks evaluated in one batch."""
+def batch_returns():
+    """Returns of ten tasks that were evaluated in one batch."""
     return returns(evaluate("random", random, SIMPLE + RING, PUBLISHED))
 
 
-def test_a_task_earns_the_same_alone_and_in_a_batch(together):
+def test_returns_of_a_task_do_not_depend_on_other_tasks_in_batch(batch_returns):
     alone = returns(evaluate("random", random, [RING[3]], PUBLISHED))
-    assert alone[RING[3].task_id] == together[RING[3].task_id]
+    assert alone[RING[3].task_id] == batch_returns[RING[3].task_id]
     assert returns(evaluate("random", random, RING[::-1], PUBLISHED)) == {
-        task.task_id: together[task.task_id] for task in RING
+        task.task_id: batch_returns[task.task_id] for task in RING
     }
 
 
-def test_an_interrupted_run_resumes_to_the_same_results(together, tmp_path):
+def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_returns, tmp_path):
     first = evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
     started = []
 
@@ -67,22 +67,22 @@ def test_an_interrupted_run_resumes_to_the_same_results(together, tmp_path):
 
     played: list[int] = []
     again = evaluate("random", watched, SIMPLE + RING, PUBLISHED, out=tmp_path, played=played.append)
-    assert returns(again) == together
-    assert played == [5 * 4, 5, 5, 5, 5]  # finished tasks are reported at once, the others episode by episode
+    assert returns(again) == batch_returns
+    assert played == [5 * 4, 5, 5, 5, 5]  # stored tasks are reported in one call, others after each episode
     assert started == ["coord_ring"]
     assert len(list((tmp_path / "tasks").iterdir())) == 10
     assert read_result(tmp_path / "tasks" / f"{SIMPLE[0].task_id}.json") == first[0]
 
 
-def test_seeds_and_tasks_differ(together):
-    """Seeds in one batch do not affect each other."""
+def test_seeds_and_tasks_give_different_returns(batch_returns):
+    """Seeds that are evaluated in one batch do not affect each other."""
     both = returns(evaluate("random", random, SIMPLE, PUBLISHED, seeds=[7, 0]))
-    assert all(both[task.task_id][1:] == together[task.task_id] for task in SIMPLE)
-    assert any(both[task.task_id][0] != together[task.task_id][0] for task in SIMPLE)
-    assert len({tuple(together[task.task_id][0]) for task in SIMPLE}) > 1
+    assert all(both[task.task_id][1:] == batch_returns[task.task_id] for task in SIMPLE)
+    assert any(both[task.task_id][0] != batch_returns[task.task_id][0] for task in SIMPLE)
+    assert len({tuple(batch_returns[task.task_id][0]) for task in SIMPLE}) > 1
 
 
-def test_results_of_other_settings_are_never_reused(tmp_path):
+def test_folder_with_results_of_other_settings_raises_error(tmp_path):
     evaluate("stay", stay, SIMPLE, PUBLISHED, out=tmp_path)
     with pytest.raises(OptionError, match="holds a result of other settings"):
         evaluate("stay", stay, SIMPLE, PUBLISHED, seeds=[1], out=tmp_path)
@@ -90,7 +90,7 @@ def test_results_of_other_settings_are_never_reused(tmp_path):
         evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
 
 
-def test_folders_with_other_files_are_refused(tmp_path):
+def test_output_folder_with_other_files_raises_error(tmp_path):
     (tmp_path / "notes.txt").touch()
     with pytest.raises(OptionError, match=r"has other files \(notes.txt\), expected results of `evaluate`"):
         evaluate("stay", stay, SIMPLE, PUBLISHED, out=tmp_path)
@@ -110,14 +110,14 @@ def test_folders_with_other_files_are_refused(tmp_path):
         ({"tasks": ["demo_wide"]}, "tasks: 'demo_wide': expected tasks, such as those of test_tasks"),
     ],
 )
-def test_invalid_arguments(arguments, message):
+def test_invalid_arguments_of_evaluate_raise_errors(arguments, message):
     with pytest.raises((OptionError, UnknownNameError), match=message):
         evaluate(**{"agent": "stay", "make_ego": stay, "tasks": SIMPLE, "protocol": "published"} | arguments)
     with pytest.raises(OptionError, match="agent = 5: expected an object with the methods reset and act"):
         from_host(5)  # type: ignore[arg-type]
 
 
-def test_damaged_results_are_named(tmp_path):
+def test_damaged_result_file_raises_error(tmp_path):
     evaluate("stay", stay, SIMPLE, PUBLISHED, out=tmp_path)
     path = min((tmp_path / "tasks").iterdir())
     content = json.loads(path.read_text())
@@ -131,7 +131,7 @@ def test_damaged_results_are_named(tmp_path):
 
 
 class Watcher:
-    """A host agent that plays fixed actions and records its ego_inputs."""
+    """A host agent that plays given or random actions and records its inputs."""
 
     def __init__(self, actions=None):
         self.actions = actions
@@ -167,7 +167,7 @@ def test_host_agents_receive_observations_and_rewards():
     assert not watcher.seen[0].prev_reward.any()
 
 
-def test_recorded_play_follows_the_rules():
+def test_states_and_rewards_of_played_episodes_follow_the_rules():
     protocol = dataclasses.replace(PUBLISHED, episodes=1)
     (played,) = play_tasks(random, RING, protocol, [3])
     record, actions = np.asarray(played.record), np.asarray(played.actions)
@@ -177,7 +177,7 @@ def test_recorded_play_follows_the_rules():
     np.testing.assert_array_equal(outcome.reward, played.reward[:, :-1])
 
 
-def test_invalid_actions_of_host_agents():
+def test_out_of_range_action_of_host_agent_raises_error():
     watcher = Watcher(lambda batch: np.full(batch, 6))
     with pytest.raises(OptionError, match=r"returned actions 6\.\.6 on coord_simple, expected 0\.\.5"):
         evaluate("mine", from_host(watcher), SIMPLE, dataclasses.replace(PUBLISHED, episodes=1))
@@ -190,8 +190,8 @@ def test_invalid_actions_of_host_agents():
         (np.zeros(1), r"returned float64 of shape \(1,\), expected integers \(1,\)"),
     ],
 )
-def test_host_agents_return_one_integer_per_task(actions, message):
-    """The environment is not stepped, because compiling it takes seconds."""
+def test_host_agent_actions_of_wrong_shape_or_type_raise_errors(actions, message):
+    """Only the policy is called, since compiling the environment's step takes seconds."""
     policy, keys = from_host(Watcher(lambda batch: actions))(LAYOUTS["coord_simple"]), jnp.zeros(1, jnp.uint32)
     ego_input = EgoInput(jnp.zeros((1, 5, 5, 40)), *[jnp.zeros(1)] * 4)
     memory = policy.init((), keys)
@@ -200,7 +200,7 @@ def test_host_agents_return_one_integer_per_task(actions, message):
 
 
 @pytest.mark.parametrize("action", [jnp.zeros(3, jnp.int32), jnp.float32(1)])
-def test_invalid_actions_of_jax_agents(action):
+def test_jax_agent_action_of_wrong_shape_or_type_raises_error(action):
     def mine(layout):
         return Policy((), lambda params, key: (), lambda params, carry, view, key: (action, carry), "observation")
 
@@ -208,12 +208,12 @@ def test_invalid_actions_of_jax_agents(action):
         evaluate("mine", mine, SIMPLE, PUBLISHED)
 
 
-def test_memory_lasts_for_the_task():
-    """An ego's step counter continues over episodes and starts at 0 in each task."""
+def test_ego_memory_is_kept_between_episodes_of_a_task():
+    """An ego that counts its steps plays `stay` in the first episode and `interact` in the second."""
 
     def mine(layout):
         def act(params, count, view, key):
-            return jnp.where(count < 100, 4, 5), count + 1  # `stay` in the first episode, `interact` in the second
+            return jnp.where(count < 100, 4, 5), count + 1  # 4 is `stay`, 5 is `interact`
 
         return Policy((), lambda params, key: jnp.int32(0), act, "observation")
 
@@ -223,7 +223,7 @@ def test_memory_lasts_for_the_task():
     assert (second.actions[..., 0] == 5).all()
 
 
-def test_unusable_teammates_are_refused_before_evaluation(tmp_path):
+def test_invalid_teammate_raises_error_before_evaluation_starts(tmp_path):
     wrong = dataclasses.replace(
         SIMPLE[1], teammate=SIMPLE[1].teammate | {"theta": SIMPLE[1].teammate["theta"] | {"inertia": 2.0}}
     )
@@ -232,7 +232,7 @@ def test_unusable_teammates_are_refused_before_evaluation(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_tasks_and_episodes_are_limited():
+def test_tasks_per_family_and_episodes_can_be_limited():
     assert limit_tasks(SIMPLE + RING, 2) == SIMPLE[:2] + RING[:2]
     assert limit_tasks(SIMPLE, None) == SIMPLE
     assert get_protocol("seeded", 3) == dataclasses.replace(PROTOCOLS["seeded"], episodes=3)
@@ -242,7 +242,7 @@ def test_tasks_and_episodes_are_limited():
         get_protocol("seeded", 0)
 
 
-def test_layouts_that_do_not_show_the_dish_are_named():
+def test_note_names_layouts_that_hide_the_recipe_from_the_ego():
     simple, right = ([task for task in ALL if task.layout.name == name] for name in ("demo_simple", "asymm_right"))
     assert hidden_recipe_note(simple) == ""
     note = hidden_recipe_note([*simple, *right])
@@ -251,7 +251,7 @@ def test_layouts_that_do_not_show_the_dish_are_named():
     assert "asymm_both_plain, test_wide_plain, rooms-0-46" in preference and "throughout" in preference
 
 
-def test_commands(tmp_path):
+def test_evaluate_and_report_commands_write_results_and_tables(tmp_path):
     write_tasks(tmp_path / "two.jsonl", SIMPLE[:2])
     options = ["--protocol", "published", "--manifest", str(tmp_path / "two.jsonl"), "--out", str(tmp_path / "run")]
     options += ["--tasks", "1", "--episodes", "4"]
@@ -270,6 +270,6 @@ def test_commands(tmp_path):
         run_cli("evaluate", "--agent", "stay", *options)
 
 
-def test_headroom_cards_cover_every_cell():
+def test_headroom_is_stored_for_every_layout_and_family_of_test_tasks():
     for protocol in ("published", "seeded"):
         assert set(read_headroom(protocol)) == {(task.layout.name, task.teammate_family) for task in ALL}

@@ -1,4 +1,4 @@
-"""Learned teammates that a suite holds out of training: a model is trained, evaluated with them and reported."""
+"""Evaluation with the learned teammates that a suite of teammates holds out of training."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from tests.helpers.random_releases import random_release
 
 @pytest.fixture
 def suite(tmp_path) -> Path:
-    """Write a suite of one untrained checkpoint that is held out on cramped_up."""
+    """Write a suite of teammates with one untrained policy that is held out on cramped_up."""
     root, layout = tmp_path / "suite", get_layout("cramped_up")
     network, where = ActorCritic(Widths((4,), (4,), 8, 8, 8)), "cramped_up/fcp/m0/c0"
     shapes = jax.eval_shape(lambda: network.untrained(jax.random.key(0), layout.channels))
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # skips compiling the initialisation
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # avoids a slow initialization
     save_policy(root / where, network, zeros, {"seed": 0})
     entry = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0}
     entry["theta"] = {"checkpoint": where, "sha256": file_hash(root / where / POLICY_WEIGHTS)}
@@ -38,7 +38,7 @@ def suite(tmp_path) -> Path:
 
 
 @pytest.mark.slow
-def test_a_model_plays_with_held_out_teammates(suite, tmp_path):
+def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, tmp_path):
     release, trained, results = tmp_path / "release", tmp_path / "run", tmp_path / "results"
     random_release(release, layouts=("cramped_up",), teammates=1, streams=2, episodes=2)
     small = "--steps 1 --context 8 --batch-size 2 --validation-batches 1 --layers 1 --width 8 --heads 2 --ta --next-obs"

@@ -25,13 +25,13 @@ OPTIONS = dataclasses.replace(TINY, layers=1, dropout=0.0)
 
 @pytest.fixture(scope="module")
 def two_layouts(tmp_path_factory) -> Path:
-    """Return a release of two layouts whose observations have one shape."""
+    """Return a release of two layouts whose observations have the same shape."""
     root = tmp_path_factory.mktemp("releases") / "two"
     random_release(root, layouts=("asymm_both", "cramped_up"))
     return root
 
 
-def made(kind: Any, view: Any = None) -> Method:
+def make_method(kind: Any, view: Any = None) -> Method:
     return get_method("ad")(
         dataclasses.replace(OPTIONS, encoder=kind), overcooked_world([get_layout("demo_wide")], kind, view)
     )
@@ -60,9 +60,9 @@ def assert_equal_results(one: Any, two: Any, params: Any) -> None:
     jax.tree.map(compare, gradient, other_gradient)
 
 
-def test_words_give_the_loss_and_gradient_of_the_paper(lite):
-    """The paper's encoder gets observations, `words` gets state records."""
-    paper, words = made("paper", plain_view), made("words")
+def test_words_encoder_has_the_loss_and_gradient_of_the_paper_encoder(lite):
+    """The paper's encoder receives observations; the encoder `words` receives state records."""
+    paper, words = make_method("paper", plain_view), make_method("words")
     params = random_parameters(paper)
     jax.tree.map(np.testing.assert_array_equal, params, random_parameters(words))
     found = loss_and_gradient(words, params, batch_of(lite[0], "state"))
@@ -71,8 +71,8 @@ def test_words_give_the_loss_and_gradient_of_the_paper(lite):
 
 
 @pytest.mark.parametrize("collide", [False, True])
-def test_equal_observations_are_in_one_group(monkeypatch, collide):
-    """If hashes collide, each observation is its own group."""
+def test_equal_observations_are_grouped_unless_hashes_collide(monkeypatch, collide):
+    """If hashes collide, each observation forms a group by itself."""
     if collide:
         monkeypatch.setattr(encoder, "_hash_words", lambda ids: (jnp.zeros(len(ids), jnp.uint32),) * 2)
     ids = np.random.default_rng(0).integers(0, 300, (4, 25))[[[0, 1, 0, 2], [1, 1, 3, 0]]]
@@ -86,7 +86,7 @@ def test_equal_observations_are_in_one_group(monkeypatch, collide):
 
 @pytest.mark.parametrize("canonical", [False, True])
 @pytest.mark.parametrize("kind", ["paper", "words", "mlp"])
-def test_inputs_on_several_layouts_equal_the_observations(two_layouts, kind, canonical):
+def test_views_of_states_on_several_layouts_equal_the_observations(two_layouts, kind, canonical):
     layouts = tuple(get_layout(name) for name in ("asymm_both", "cramped_up"))
     view = CompactView(kind, layouts, canonical=canonical)
     channels = "canonical" if canonical else "own"

@@ -1,4 +1,4 @@
-"""The models: sizes, causality, and equal outputs in training, cached and exact acting."""
+"""The models: parameter counts, causality, and equal outputs in training and in cached and exact acting."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ from tests.helpers.small_models import FLAT, TINY, ad_batch, dpt_batch, random_p
 STEPS = ("ad", "hybrid_ad", pytest.param("amago_offline", marks=pytest.mark.slow))
 
 
-def sizes(method: Method) -> int:
+def parameter_count(method: Method) -> int:
     return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(method.init, jax.random.key(0))))
 
 
 @cache
 def tiny(name: str, **changes: Any) -> tuple[Method, Any]:
-    """Return a method for flat observations, and parameters without zeros."""
+    """Return a method for flat observations, and random parameters."""
     method = get_method(name)(dataclasses.replace(TINY, **changes), FLAT)
     return method, random_parameters(method)
 
 
 def run(method: Method, params: Any, *inputs: Any, **named: Any) -> Any:
-    """Return the output of the model."""
+    """Apply the model of a method to inputs and return the output."""
     return method.model.apply({"params": params}, *inputs, **named)
 
 
 class TestSizes:
     @pytest.mark.parametrize(("name", "parameters"), [("ad", 3_283_870), ("dpt", 3_285_022), ("hybrid_ad", 913_310)])
-    def test_published_parameter_counts(self, name, parameters):
+    def test_default_models_have_the_published_parameter_counts(self, name, parameters):
         world = overcooked_world([get_layout("coord_simple")])
-        assert sizes(get_method(name)(ModelOptions(), world)) == parameters
+        assert parameter_count(get_method(name)(ModelOptions(), world)) == parameters
 
-    def test_invalid_model_options(self):
+    def test_invalid_model_options_raise_errors(self):
         with pytest.raises(OptionError, match="width = 30: expected a multiple of twice the heads"):
             ModelOptions(width=30)
         with pytest.raises(OptionError, match="dropout = 1"):
@@ -60,8 +60,8 @@ class TestSizes:
             get_method("DTP")
 
 
-def reach(f, *inputs) -> list[np.ndarray]:
-    """Return, for each input (T, ..), which outputs (O, ..) of f depend on which rows, bool (O, T)."""
+def dependence(f, *inputs) -> list[np.ndarray]:
+    """Return bool (O, T) for each input (T, ..): which outputs (O, ..) of f depend on which rows of the input."""
     jacobians = jax.jit(jax.jacobian(f, argnums=tuple(range(len(inputs)))))(*inputs)
     return [
         np.abs(np.asarray(jacobian).reshape(len(jacobian), -1, len(x), x[0].size)).max(axis=(1, 3)) > 0
@@ -78,7 +78,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize(("name", "positions"), KINDS)
-def test_outputs_depend_on_past_and_present_steps_only(name, positions):
+def test_outputs_depend_only_on_past_and_present_steps(name, positions):
     method, params = tiny(name, positions=positions)
     steps = batch_steps(ad_batch(rows=1), plain_view)
 
@@ -86,12 +86,12 @@ def test_outputs_depend_on_past_and_present_steps_only(name, positions):
         changed = steps._replace(obs=obs[None], prev_reward=rewards[None])
         return method.logits(run(method, params, changed).head)[0]
 
-    for found in reach(policy, steps.obs[0], steps.prev_reward[0]):
+    for found in dependence(policy, steps.obs[0], steps.prev_reward[0]):
         np.testing.assert_array_equal(found, np.tril(np.ones((7, 7), bool)))
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_policies_depend_on_earlier_actions(name):
+def test_policies_depend_on_earlier_actions_of_both_agents(name):
     method, params = tiny(name)
     steps = batch_steps(ad_batch(rows=1), plain_view)
 
@@ -117,7 +117,7 @@ def test_dpt_outputs_depend_on_the_query_and_context(positions):
         changed = batch._replace(context_obs=obs[None], context_rewards=rewards[None], query_obs=query)
         return run(method, params, *batch_transitions(changed, plain_view)).logits[0]
 
-    of_obs, of_rewards, of_query = reach(answers, batch.context_obs[0], batch.context_rewards[0], batch.query_obs)
+    of_obs, of_rewards, of_query = dependence(answers, batch.context_obs[0], batch.context_rewards[0], batch.query_obs)
     seen = np.tril(np.ones((7, 6), bool), k=-1)  # output j depends on the first j transitions
     assert seen[-1].all()
     np.testing.assert_array_equal(of_obs, seen)
@@ -125,7 +125,7 @@ def test_dpt_outputs_depend_on_the_query_and_context(positions):
     assert of_query.all()
 
 
-def test_several_queries_equal_single_queries():
+def test_several_dpt_queries_give_outputs_of_single_queries():
     method, params = tiny("dpt")
     batch = dpt_batch(rows=2)
     other = batch._replace(query_obs=batch.query_obs[::-1], query_target=1 + batch.query_target)
@@ -151,20 +151,20 @@ def test_several_queries_equal_single_queries():
 
 
 def query_mask(context: int) -> np.ndarray:
-    """Mask of [c_1 .. c_K, q_0 .. q_K]: c_i attends to c_1 .. c_i, q_j to c_1 .. c_j and itself."""
+    """Return the mask of [c_1 .. c_K, q_0 .. q_K]: c_i attends to c_1 .. c_i; q_j attends to c_1 .. c_j and q_j."""
     to_context = np.concatenate([np.tri(context), np.tri(context + 1, context, -1)])
     to_queries = np.concatenate([np.zeros((context, context + 1)), np.eye(context + 1)])
     return np.concatenate([to_context, to_queries], axis=1).astype(bool)
 
 
-def test_attention_equals_masked_attention(monkeypatch):
-    """Values and gradients agree to float32 rounding, with and without blocks of rows."""
+def test_causal_attention_equals_attention_with_a_mask(monkeypatch):
+    """Values and gradients agree to float32 rounding, also if attention is computed in blocks of rows."""
     q, k, v, to = np.random.default_rng(0).normal(size=(4, 2, 15, 2, 8)).astype(np.float32)
 
-    def of_mask(q, k, v):
+    def masked(q, k, v):
         return jax.nn.dot_product_attention(q, k, v, mask=jnp.asarray(query_mask(7))[None, None])
 
-    def ours(q, k, v):
+    def unmasked(q, k, v):
         context = attention.causal_attention(q[:, :7], k[:, :7], v[:, :7])
         queries = attention.causal_attention(q[:, 7:], k[:, :7], v[:, :7], k[:, 7:], v[:, 7:])
         return jnp.concatenate([context, queries], axis=1)
@@ -172,11 +172,11 @@ def test_attention_equals_masked_attention(monkeypatch):
     def results(attend):
         return jax.jit(jax.value_and_grad(lambda *qkv: (attend(*qkv) * to).sum(), argnums=(0, 1, 2)))(q, k, v)
 
-    expected = results(of_mask)
+    expected = results(masked)
     for short, long in ((attention.SHORT_ROWS, attention.LONG_ROWS), (3, 15), (3, 5)):
         monkeypatch.setattr(attention, "SHORT_ROWS", short)
         monkeypatch.setattr(attention, "LONG_ROWS", long)
-        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-5, atol=5e-6), results(ours), expected)
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-5, atol=5e-6), results(unmasked), expected)
 
 
 def arrays_in(jaxpr: Any) -> Iterator[Any]:
@@ -189,7 +189,7 @@ def arrays_in(jaxpr: Any) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("name", ["ad", "dpt"])
-def test_long_contexts_need_no_quadratic_memory(name):
+def test_memory_of_long_contexts_is_not_quadratic(name):
     method, params = tiny(name, layers=1)
     batch = ad_batch(rows=1, length=3072) if name == "ad" else dpt_batch(rows=1, context=3072)
     made = jax.make_jaxpr(jax.grad(lambda p: method.loss(p, p, batch, jax.random.key(0))[0]))(params)
@@ -207,18 +207,18 @@ def test_padding_does_not_change_the_loss(name):
     other = jax.tree.map(lambda a, b: np.where(mask.reshape(3, 7, *[1] * (a.ndim - 2)), a, b), batch, garbage)
     batch, other = (b._replace(attention_mask=mask) for b in (batch, other))
 
-    def of(batch):
+    def loss_of(batch):
         return method.loss(params, params, batch, None)
 
-    loss = jax.jit(of)
+    loss = jax.jit(loss_of)
     assert loss(batch)[0] != loss(batch._replace(attention_mask=np.ones_like(mask)))[0]
     for one, two in zip(*(jax.tree.leaves(loss(b)) for b in (batch, other)), strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-6)
-    gradient = jax.jit(jax.grad(lambda obs: of(batch._replace(obs=obs))[0]))(batch.obs)
+    gradient = jax.jit(jax.grad(lambda obs: loss_of(batch._replace(obs=obs))[0]))(batch.obs)
     assert not np.abs(gradient)[~mask].any()
 
 
-def test_bfloat16_computes_nearly_the_same():
+def test_bfloat16_loss_is_close_to_float32_loss():
     full, params = tiny("ad", layers=1)
     half, batch = tiny("ad", layers=1, bfloat16=True)[0], ad_batch()
     one, two = (jax.jit(method.loss)(params, params, batch, None)[0] for method in (full, half))
@@ -227,7 +227,7 @@ def test_bfloat16_computes_nearly_the_same():
 
 
 @pytest.mark.slow
-def test_remat_changes_no_gradient():
+def test_rematerialization_does_not_change_gradients():
     gradients = []
     for remat in (False, True):
         method, params = tiny("ad", layers=1, remat=remat)
@@ -236,7 +236,7 @@ def test_remat_changes_no_gradient():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *gradients)
 
 
-def test_next_observations_are_of_the_same_episode_and_follow_the_actions_taken():
+def test_next_observation_loss_uses_taken_actions_within_an_episode():
     method, params = tiny("ad", layers=1)
     batch = ad_batch()
     log = jax.jit(lambda b: method.loss(params, params, b, None)[1])
@@ -245,10 +245,10 @@ def test_next_observations_are_of_the_same_episode_and_follow_the_actions_taken(
         return log(b)["next_obs_loss"]
 
     after_the_end, within = batch.obs.copy(), batch.obs.copy()
-    after_the_end[:, 4] += 100  # the first step after the episode ends at step 3
+    after_the_end[:, 4] += 100  # the episode ends at step 3, so step 4 is in the next episode
     within[:, 3] += 100
     assert loss(batch._replace(dones=np.ones_like(batch.dones))) == 0
-    last = batch._replace(dones=np.broadcast_to(np.arange(7) != 2, (2, 7)))  # only the last step of an episode counts
+    last = batch._replace(dones=np.broadcast_to(np.arange(7) != 2, (2, 7)))  # all steps but step 2 end an episode
     assert loss(last) == loss(last._replace(obs=after_the_end)) != loss(last._replace(obs=within))
     labelled = batch._replace(target_actions=(batch.target_actions + 1) % 4)
     assert loss(batch) == loss(labelled) != 0
@@ -256,7 +256,7 @@ def test_next_observations_are_of_the_same_episode_and_follow_the_actions_taken(
 
 
 def ego_inputs(steps: int, episode: int, seed=0) -> EgoInput:
-    """Return the inputs of an ego for consecutive steps."""
+    """Return random inputs of an ego for consecutive steps."""
     rng = np.random.default_rng(seed)
     t = np.arange(steps)
     zero_first = t > 0
@@ -285,7 +285,7 @@ def player(name: str, context: int, cached: bool, **changes: Any):
 
 
 @pytest.mark.parametrize(("name", "positions"), KINDS)
-def test_cached_equals_exact_until_the_window_is_full(name, positions):
+def test_cached_acting_equals_exact_acting_until_the_window_is_full(name, positions):
     seen = ego_inputs(12, episode=4)
     exact, cached = (player(name, 12, way, positions=positions)(seen) for way in (False, True))
     np.testing.assert_allclose(exact, cached, rtol=1e-4, atol=1e-5)
@@ -293,14 +293,14 @@ def test_cached_equals_exact_until_the_window_is_full(name, positions):
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_acting_computes_what_training_computes(name):
+def test_acting_gives_the_outputs_of_training(name):
     method, params = tiny(name)
     seen = ego_inputs(9, episode=4)
     steps = jax.tree.map(lambda x: x[None], input_step(seen))
     policy = jax.jit(lambda steps: method.logits(run(method, params, steps).head)[0])
     expected = policy(steps)
     np.testing.assert_allclose(player(name, 12, False)(seen), expected, rtol=1e-4, atol=1e-5)
-    # a full window holds the last K steps, as a window of training data does
+    # A full window contains the last K steps, like a window of training data.
     last = policy(jax.tree.map(lambda x: x[:, -4:], steps))[-1]
     np.testing.assert_allclose(player(name, 4, False)(seen)[-1], last, rtol=1e-4, atol=1e-5)
 
@@ -313,10 +313,10 @@ def test_acting_computes_what_training_computes(name):
         (4, 2, "rope"),
     ],
 )
-def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first, positions):
+def test_dpt_acts_by_the_transitions_of_finished_episodes(context, first, positions):
     method, params = tiny("dpt", positions=positions)
-    seen = ego_inputs(11, episode=4)  # two finished episodes, and three steps of the third
-    known = np.array([0, 1, 2, 4, 5, 6])[first:]  # the last step of an episode has no next state
+    seen = ego_inputs(11, episode=4)  # two finished episodes, then three steps
+    known = np.array([0, 1, 2, 4, 5, 6])[first:]  # steps 3 and 7 end episodes and have no next observation
     after = jax.tree.map(lambda x: x[known + 1][None], seen)
     both = jnp.stack([seen.obs[known][None], after.obs], axis=2)
     transitions = Transition(both, after.prev_action, after.prev_reward, after.prev_teammate_action)
@@ -337,8 +337,8 @@ def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first, p
         ("dpt", 5, 8, True),
     ],
 )
-def test_steps_outside_the_context_have_no_effect(name, context, first_without, cached):
-    """The first step leaves AD's window after 5 steps and DPT's context after two episodes of 3 steps."""
+def test_steps_outside_the_context_do_not_affect_outputs(name, context, first_without, cached):
+    """The first step leaves AD's window after 5 steps, and DPT's context after two episodes of 3 transitions."""
     seen = ego_inputs(12, episode=4)
     play = player(name, context, cached)
     changed = seen._replace(obs=seen.obs.at[0].add(3.0))
@@ -347,8 +347,8 @@ def test_steps_outside_the_context_have_no_effect(name, context, first_without, 
     assert not difference[first_without:].any()
 
 
-def test_a_full_cached_window_drops_a_fifth():
-    """With K = 10, the window drops 2 steps when full and so alternates between 9 and 10."""
+def test_full_cached_window_drops_a_fifth_of_its_steps():
+    """With K = 10, a full window drops 2 steps, so its length alternates between 9 and 10 steps."""
     seen = ego_inputs(16, episode=4)
     cached, ten, nine = (player("ad", context, way)(seen) for context, way in ((10, True), (10, False), (9, False)))
     np.testing.assert_allclose(cached[:10], ten[:10], rtol=1e-4, atol=1e-5)
@@ -358,7 +358,7 @@ def test_a_full_cached_window_drops_a_fifth():
 
 
 class TestChangeIf:
-    """`change_if` computes a change only when a row of the batch needs it."""
+    """`change_if` computes a change only if the condition of at least one row of the batch is true."""
 
     CONDITION = jnp.array([True, False, True])
 
@@ -369,7 +369,7 @@ class TestChangeIf:
     def rows(self, condition, add, memory):
         return change_if(condition, self.change, {"scale": jnp.float32(3), "add": add}, memory)
 
-    def test_each_row_changes_by_its_own_condition(self):
+    def test_rows_change_only_if_their_condition_is_true(self):
         add, memory = jnp.array([10, 20, 30]), {"a": jnp.arange(6.0).reshape(3, 2), "b": jnp.arange(3)}
         changed = jax.jit(jax.vmap(self.rows))(self.CONDITION, add, memory)
         np.testing.assert_array_equal(changed["a"], [[0, 3], [2, 3], [12, 15]])
@@ -379,7 +379,7 @@ class TestChangeIf:
         alike = jax.vmap(self.rows, in_axes=(0, None, None))(self.CONDITION, 5, {"a": jnp.ones(2), "b": jnp.int32(1)})
         np.testing.assert_array_equal(alike["b"], [6, 1, 6])
 
-    def test_unchanged_batches_skip_the_computation(self):
+    def test_change_is_not_computed_if_no_row_needs_it(self):
         calls = []
 
         def noted(params, memory):
@@ -393,8 +393,8 @@ class TestChangeIf:
 
 
 @pytest.mark.slow
-def test_amago_learns_the_rewarded_action():
-    """Train on random play that rewards action 2; imitation alone would stay random."""
+def test_amago_learns_to_choose_the_rewarded_action():
+    """Train on random actions with reward for action 2; a model that only imitates would act randomly."""
     options = ModelOptions(layers=1, width=16, heads=2, dropout=0.0, discounts=(0.5, 0.8))
     method = get_method("amago_offline")(options, FLAT)
     params = slow = random_parameters(method)

@@ -1,4 +1,4 @@
-"""Mirrored and hidden views: a mirrored view equals the view on the mirrored layout."""
+"""Changed views of an ego: mirrored layouts and hidden recipe indicators."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from icrl4aht_data.overcooked.state import start_record
 
 LAYOUT = get_layout("cramped_up")
 MIRRORINGS = list(product((False, True), repeat=2))
-"""Whether rows and whether columns are exchanged."""
+"""All pairs of flags: whether the order of rows is reversed, and whether the order of columns is."""
 
 
 def mirrored_layout(layout: Layout, rows: bool, columns: bool) -> Layout:
@@ -48,7 +48,7 @@ def change(rows: bool, columns: bool, hidden: bool = False) -> ViewChange:
 
 @pytest.mark.parametrize(("rows", "columns"), MIRRORINGS)
 def test_mirrored_views_equal_views_on_the_mirrored_layout(rows, columns):
-    """Play both layouts from the same start, the mirrored one with mirrored actions."""
+    """Play a layout and its mirrored version from corresponding states, with actions and mirrored actions."""
     rng, other = np.random.default_rng(0), mirrored_layout(LAYOUT, rows, columns)
     free = np.flatnonzero(LAYOUT.walkable)
     positions = rng.choice(free, (64, 2)).astype(np.uint8)
@@ -70,11 +70,11 @@ def test_mirrored_views_equal_views_on_the_mirrored_layout(rows, columns):
         mirrored = np.asarray(view.actions(jnp.asarray(actions)))
         one = rules.step(LAYOUT, one, actions, recipe).state
         two = rules.step(other, two, mirrored, recipe).state
-    assert seen > 0  # an agent held an item at some step
+    assert seen > 0  # at some step an item was visible
 
 
-def test_a_hidden_recipe_indicator_looks_like_a_counter():
-    """asymm_right differs from asymm_both only by the missing recipe indicator in the ego's room."""
+def test_hidden_recipe_indicator_looks_like_a_counter():
+    """asymm_right equals asymm_both without the recipe indicator in the ego's part of the layout."""
     both, right = get_layout("asymm_both"), get_layout("asymm_right")
     positions = np.array([[both.agent_cells[0], both.agent_cells[1]]], np.uint8)
     facings, recipe = np.zeros((1, 2), np.uint8), both.recipe_items[:1]
@@ -87,8 +87,8 @@ def test_a_hidden_recipe_indicator_looks_like_a_counter():
     np.testing.assert_array_equal(no_change().observations(shown), shown)
 
 
-def test_views_of_batches():
-    """A row's layout number encodes the layout and its mirroring."""
+def test_view_of_a_batch_is_changed_by_layout_numbers():
+    """The layout number of a row encodes both the layout and how the view is mirrored."""
     layouts = [get_layout("asymm_both"), LAYOUT]
     size = max(layout_size(layout) for layout in layouts)
     records = np.zeros((4, 2, size), np.uint8)
@@ -110,7 +110,7 @@ def layout_size(layout: Layout) -> int:
     return start_record(layout, one, one, layout.recipe_items[:1]).shape[-1]
 
 
-def test_mirrored_actions_of_rows():
+def test_mirrored_action_in_numpy_equals_view_change_in_jax():
     actions = np.tile(np.arange(6, dtype=np.int32), (4, 1))
     found = mirrored_action(actions, np.arange(4))
     for row, (columns, rows) in enumerate(MIRRORINGS):
@@ -118,8 +118,8 @@ def test_mirrored_actions_of_rows():
     assert found.dtype == np.int32
 
 
-def test_mirrored_batches():
-    """The batch says how each row is mirrored, and its actions are those of the mirrored view."""
+def test_mirrored_batches_have_mirrored_actions():
+    """A mirrored batch contains mirrored actions, and encodes in its layout numbers how rows are mirrored."""
     dataset = load_icrl4aht(layout=["asymm_both", "demo_wide"], split="train", obs="state", channels="canonical")
     layouts = [*reversed(dataset.layouts)]
     sampler = dataset.ad(batch_size=64, length=40, seed=3, labels="expert", teammate_actions=True)
@@ -127,7 +127,7 @@ def test_mirrored_batches():
     mirroring, number = np.divmod(mirrored.layouts, len(layouts))
     np.testing.assert_array_equal(number, plain.layouts)
     assert set(mirroring) == {0, 1, 2, 3}
-    np.testing.assert_array_equal(mirrored.obs, plain.obs)  # of the state: the view mirrors them
+    np.testing.assert_array_equal(mirrored.obs, plain.obs)  # state records are mirrored later, by the view
     np.testing.assert_array_equal(mirrored.target_actions, mirrored_action(plain.target_actions, mirroring))
     first = plain.is_first | ~plain.attention_mask
     np.testing.assert_array_equal(mirrored.prev_actions[first], 0)

@@ -1,4 +1,4 @@
-"""Histories recorded from trained agents: arrays, labels, teammates, resume and the release."""
+"""Histories recorded from trained agents: labels, teammates, resume and the release."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CONFIG = NoiseConfig(2, 10, start=(1.0, 1.0), end=(0.0, 0.0))
 
 
 def cook(layout: Any) -> Policy:
-    """An agent that always interacts."""
+    """Return an agent that always chooses `interact`."""
     return Policy((), lambda params, key: (), lambda params, memory, view, key: (jnp.int32(5), memory), "ego_input")
 
 
@@ -42,13 +42,13 @@ COOK = NamedEgo("cook", cook, {"version": 1})
 
 @pytest.fixture(scope="module")
 def dataset() -> Any:
-    """Return bundled histories of one layout with heuristic teammates of one family."""
+    """Return histories of the bundled release on one layout with heuristic teammates of one family."""
     return load_icrl4aht(layout="cramped_up").filter(teammate_family="H3")
 
 
 @pytest.fixture(scope="module")
 def teammates(dataset) -> Teammates:
-    """Return the teammates of these histories. It is known of the second one alone that the oracle is of no use."""
+    """Return the teammates of `dataset`; for the second one, invented references say that the oracle earns less."""
     found = release_teammates(dataset)
     useless = ReferenceEgos(stay=0.0, random=0.0, oracle=-1000.0, episodes=100)
     return found._replace(references={found.tasks[1].task_id: useless})
@@ -59,13 +59,13 @@ def release(teammates, tmp_path_factory) -> Path:
     return collect_release(COOK, teammates, CONFIG, tmp_path_factory.mktemp("agent") / "release")
 
 
-def test_the_release_is_verified_to_the_last_step(release):
+def test_collected_release_passes_deep_verification(release):
     report = verify_release(release, level="deep")
     assert report.ok, report.findings
     assert not list(release.parent.glob("*.parts"))
 
 
-def test_provenance_of_the_release(release, dataset, teammates):
+def test_provenance_names_the_agent_and_tasks_without_oracle_labels(release, dataset, teammates):
     found = load_icrl4aht(release)
     made, given = release_teammates(found).tasks, release_teammates(dataset).tasks
     assert found.counts("source") == {"agent": 2 * len(given)}
@@ -83,7 +83,7 @@ def test_provenance_of_the_release(release, dataset, teammates):
     assert not set(found.column("task_id")) & set(dataset.column("task_id"))
 
 
-def test_noise_decreases_and_labels_contain_none(release):
+def test_noise_decreases_over_episodes_and_labels_have_no_noise(release):
     found = load_icrl4aht(release)
     for history in (found[0], found[len(found) - 1]):
         taken, labels = (np.asarray(values[:]).reshape(10, 100) for values in (history.actions, history.expert_actions))
@@ -92,11 +92,11 @@ def test_noise_decreases_and_labels_contain_none(release):
         assert share[0] < 0.4 and (share[-1] == 1).all()
         assert np.corrcoef(share, np.arange(10))[0, 1] > 0.9
         oracle = np.asarray(history.oracle_actions[:])
-        assert len(set(oracle.tolist())) > 3  # the script would act differently in these states
+        assert len(set(oracle.tolist())) > 3  # oracle labels differ from the constant action of the agent
 
 
-def test_another_agent_labels(dataset):
-    """The labeller receives the agent's history, including its actions."""
+def test_histories_can_be_labelled_by_another_agent(dataset):
+    """The labelling agent receives the inputs of the recorded agent, including the actions that were taken."""
 
     def counts(layout: Any) -> Policy:
         def act(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
@@ -108,25 +108,25 @@ def test_another_agent_labels(dataset):
     config = NoiseConfig(1, 10, start=(0.0, 0.0))
     found = agent_histories.record_histories(idle, tasks, config, make_labeller=counts)
     assert (found.actions == STAY).all()
-    # The first step has no previous action; later ones follow a "stay".
+    # The labelling agent counts previous `stay` actions; the first step has no previous action.
     np.testing.assert_array_equal(found.expert_actions[0], (1 + np.maximum(np.arange(1000) - 1, 0)) % 6)
     with pytest.raises(OptionError, match="the labeller takes state, expected ego_input, as the agent does"):
         agent_histories.with_noise(idle(None), 10, AGENTS["oracle"](tasks[0].layout))
 
 
-def test_teammates_of_other_tasks_are_played_as_well(dataset):
+def test_teammates_of_given_tasks_are_added_to_those_of_the_release(dataset):
     tasks = [task for track in TRACKS for task in read_tasks(manifest_path(track, "train", "diverse"))]
     plain, more = release_teammates(dataset), release_teammates(dataset, number=1, tasks=tasks)
     added = more.tasks[len(plain.tasks) :]
     here = [task for task in tasks if task.layout.name == "cramped_up"]
     assert [task.teammate for task in added] == [task.teammate for task in here] and len(here) > 30
-    assert {task.layout.name for task in added} == {"cramped_up"}  # tasks on other layouts are left out
+    assert {task.layout.name for task in added} == {"cramped_up"}  # only tasks on the release's layout are added
     assert len({task.task_id for task in plain.tasks + more.tasks}) == len(plain.tasks) + len(more.tasks)
     again = release_teammates(dataset, tasks=[*plain.tasks, *here[:1]])
-    assert len(again.tasks) == len(plain.tasks) + 1  # every teammate appears once
+    assert len(again.tasks) == len(plain.tasks) + 1  # tasks that exist already are not added twice
 
 
-def test_unusable_tasks_are_refused(dataset):
+def test_tasks_on_other_layouts_or_with_learned_teammates_raise_errors(dataset):
     with pytest.raises(OptionError, match="none of the 120 tasks of the manifests is on cramped_up; leave them out"):
         release_teammates(dataset, tasks=read_tasks(manifest_path("teammate", "test")))
     learned = replace(TEST_TASKS[0], teammate={"kind": "rl", "family": "fcp", "theta": {}})
@@ -134,10 +134,10 @@ def test_unusable_tasks_are_refused(dataset):
         release_teammates(dataset, tasks=[learned])
 
 
-def test_a_stopped_collection_resumes(release, teammates, tmp_path, monkeypatch):
+def test_stopped_collection_resumes_to_an_equal_release(release, teammates, tmp_path, monkeypatch):
     played: list[str] = []
 
-    def killed_in_the_end(*args: Any, **options: Any) -> Any:
+    def interrupted_write(*args: Any, **options: Any) -> Any:
         raise KeyboardInterrupt
 
     def record(make: Any, tasks: Any, *args: Any) -> Any:
@@ -147,7 +147,7 @@ def test_a_stopped_collection_resumes(release, teammates, tmp_path, monkeypatch)
     original, target = agent_histories.record_histories, tmp_path / "release"
     monkeypatch.setattr(agent_histories, "record_histories", record)
     with monkeypatch.context() as patch:
-        patch.setattr(agent_histories, "write_release", killed_in_the_end)
+        patch.setattr(agent_histories, "write_release", interrupted_write)
         with pytest.raises(KeyboardInterrupt):
             collect_release(COOK, teammates, CONFIG, target)
     assert not target.exists() and played == ["cramped_up"]
@@ -158,7 +158,7 @@ def test_a_stopped_collection_resumes(release, teammates, tmp_path, monkeypatch)
     assert (target / "MANIFEST.sha256").read_bytes() == (release / "MANIFEST.sha256").read_bytes()
 
 
-def test_swapped_teammates_play_in_turn(release, teammates, tmp_path):
+def test_swap_changes_the_teammate_every_few_episodes(release, teammates, tmp_path):
     tasks = [task for task in teammates.tasks if task.split == "train"][:2]
     chosen = teammates._replace(tasks=tasks)
     collect_release(COOK, chosen, CONFIG, tmp_path / "release", swap=4)
@@ -168,13 +168,13 @@ def test_swapped_teammates_play_in_turn(release, teammates, tmp_path):
         ((0, one), (4, two), (8, one)),
         ((0, two), (4, one), (8, two)),
     ]
-    for history, before in zip(swapped, plain, strict=True):  # keys depend on the task alone, not on who plays
+    for history, before in zip(swapped, plain, strict=True):  # random keys depend only on the task
         same = [(history.episodes[e].state == before.episodes[e].state).all() for e in range(10)]
         assert all(same[:4]) and not all(same[4:8])
     assert verify_release(tmp_path / "release", level="deep").findings == []
 
 
-def test_whom_teammates_take_turns_with(teammates):
+def test_planned_swaps_use_different_teammates_of_the_same_split(teammates):
     tasks = teammates.tasks
     swaps = agent_histories.plan_swaps(tasks, 10, 3)
     assert swaps.keys() == {task.task_id for task in tasks}
@@ -190,7 +190,7 @@ def test_whom_teammates_take_turns_with(teammates):
 
 
 @pytest.mark.slow
-def test_the_command(tmp_path):
+def test_collect_command_writes_a_release_and_refuses_to_overwrite(tmp_path):
     choice = ["--layout", "cramped_up", "--teammate-family", "H3", "--histories", "1", "--episodes", "10"]
     arguments = ["collect", "--agent", "random", *choice, "--out", str(tmp_path / "release")]
     printed = run_cli(*arguments)

@@ -1,4 +1,4 @@
-"""Best responses and adaptation headroom: groups of tasks, choice of trainings, tables, and a tiny training."""
+"""Best responses and adaptation headroom: groups of tasks, choice of trainings, tables and tiny trainings."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ TINY = ResponseOptions(steps=400, tasks=4)
 DEMO = tasks_of("teammate", "demo_wide")
 
 
-def test_tasks_with_headroom():
-    """Test cells count as measured, validation tasks as their draws were."""
+def test_with_headroom_drops_tasks_on_which_the_oracle_gains_little():
+    """Headroom of test tasks is stored by layout and family, headroom of validation tasks for each teammate."""
     flat = {task.layout.name for task in tasks_of("teammate")} - {
         task.layout.name for task in responses.with_headroom(tasks_of("teammate"))
     }
@@ -33,13 +33,13 @@ def test_tasks_with_headroom():
 
 
 @pytest.mark.slow
-def test_teammates_that_act_alike_share_a_best_response():
-    """H4's instances are one behaviour on test_wide, H3's are five."""
+def test_teammates_with_the_same_behaviour_share_a_best_response():
+    """On test_wide, the five H4 teammates behave the same, and the five H3 teammates differ."""
     tasks = [task for family in ("H3", "H4") for task in tasks_of("teammate", "test_wide", family)]
     assert [len(alike) for alike in responses.find_behaviours(tasks)] == [1] * 5 + [5]
 
 
-def finished(job, choice: float, earned: float, slope: float = 0.0) -> None:
+def write_finished_job(job, choice: float, earned: float, slope: float = 0.0) -> None:
     folder = job.out / job.name
     folder.mkdir(parents=True)
     modes = {"greedy": {"choice": choice, "return": earned}, "sampled": {"choice": choice - 1, "return": 99.0}}
@@ -47,19 +47,19 @@ def finished(job, choice: float, earned: float, slope: float = 0.0) -> None:
     (folder / "result.json").write_text(json.dumps(result))
 
 
-def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
+def test_best_response_is_chosen_by_separate_episodes(tmp_path):
     behaviour = (DEMO[0],)
     jobs = [ResponseJob(behaviour, seed, TINY, tmp_path) for seed in range(3)]
     assert not any(job.is_finished() for job in jobs)
-    finished(jobs[0], choice=10.0, earned=9.0)
-    finished(jobs[1], choice=8.0, earned=20.0)
+    write_finished_job(jobs[0], choice=10.0, earned=9.0)
+    write_finished_job(jobs[1], choice=8.0, earned=20.0)
     entry = responses.choose_best_response(behaviour, map(responses.trained_response, jobs[:2]))
     assert (entry.best, entry.agent) == (9.0, "best response, seed 0")
     assert [one.acting for one in entry.seeds] == ["greedy"] * 2
     path = responses.write_responses(jobs[:1], tmp_path)
     first = read_best_responses(path)
     assert first.behaviours == (responses.choose_best_response(behaviour, [responses.trained_response(jobs[0])]),)
-    responses.write_responses(jobs[1:], tmp_path)  # the first training is kept
+    responses.write_responses(jobs[1:], tmp_path)  # adds to the stored first training
     second = read_best_responses(path)
     assert second.behaviours == (entry,)
     assert second.version != first.version
@@ -70,15 +70,15 @@ def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
     row = "| demo_wide | test | H1 t0 | 9.5 | better | 9.0 to 20.0 | 2 | 400 | 128 | +0.0 |"
     assert row in responses.responses_table(tmp_path)
     pair = ResponseJob((DEMO[0], DEMO[1]), 0, TINY, tmp_path / "pair")
-    finished(pair, choice=1.0, earned=1.0)
+    write_finished_job(pair, choice=1.0, earned=1.0)
     responses.write_responses([pair], tmp_path)
     assert [one.tasks for one in read_best_responses(path).behaviours] == [(DEMO[0].task_id, DEMO[1].task_id)]
     other = ResponseJob(behaviour, 0, replace(TINY, steps=800), tmp_path)
-    assert not other.is_finished()  # a result of other settings
+    assert not other.is_finished()  # the stored result has other settings
 
 
-def test_table_of_the_adaptation_headroom(tmp_path):
-    """Differences of two seeds 4 and 6: mean 5, and Student's interval with one degree of freedom, 5 +- 12.7."""
+def test_headroom_table_shows_mean_difference_and_interval(tmp_path):
+    """Two seeds differ by 4 and 6: the mean is 5, and Student's interval with one degree of freedom is 5 +- 12.7."""
     jobs = headroom_jobs({"demo_wide": DEMO[:2]}, 2, TINY, tmp_path)
     returns = {("informed", 0): 10.0, ("informed", 1): 11.0, ("episodic", 0): 6.0, ("episodic", 1): 5.0}
     for job in jobs:
@@ -91,23 +91,23 @@ def test_table_of_the_adaptation_headroom(tmp_path):
     row = "| demo_wide | 2 | 10.5 | 5.5 | +5.0 (-7.7 to +17.7) | 2 | 400 | 128 |"
     assert adaptation_table(tmp_path).splitlines()[-1] == row
     write_adaptation([job for job in jobs if job.seed == 0], tmp_path)
-    assert "| 2 | 400 |" in adaptation_table(tmp_path), "a measurement of fewer seeds replaces none"
+    assert "| 2 | 400 |" in adaptation_table(tmp_path), "a measurement with fewer seeds does not replace the stored one"
     assert write_adaptation(headroom_jobs({"other": DEMO[2:3]}, 1, TINY, tmp_path), tmp_path).read_text().count("demo")
 
 
-def test_the_documented_headroom_is_the_bundled_one():
+def test_headroom_table_in_the_docs_matches_stored_results():
     page = (ROOT / "docs" / "preference.md").read_text(encoding="utf-8")
     assert adaptation_table(card_file("adaptation.json").parent, layouts=False) in page
 
 
-def test_every_task_must_be_played(tmp_path):
+def test_headroom_job_with_fewer_tasks_than_needed_raises_error(tmp_path):
     with pytest.raises(OptionError, match=r"tasks = 4: demo_wide has 20 tasks, .* give --tasks 20 or more"):
         HeadroomJob(tuple(DEMO), 0, TINY, tmp_path, title="demo_wide", kind="informed")
 
 
 @pytest.mark.slow
-def test_tiny_trainings(tmp_path):
-    """A best response on one task, and both egos on two layouts and families; a second call does nothing."""
+def test_tiny_best_response_and_headroom_jobs_finish(tmp_path):
+    """Train a best response for one task, and both egos of the headroom on two layouts; repeated calls do nothing."""
     job = ResponseJob((DEMO[0],), 0, TINY, tmp_path)
     calls = []
     job.run(lambda updates, speed: calls.append(updates))
@@ -116,7 +116,7 @@ def test_tiny_trainings(tmp_path):
     modes = job.result()["modes"]
     assert all(np.isfinite(list(found.values())).all() for found in modes.values())
     before = (tmp_path / job.name / "result.json").read_bytes()
-    job.run(lambda updates, speed: pytest.fail("trained again"))
+    job.run(lambda updates, speed: pytest.fail("a finished job was trained again"))
     assert (tmp_path / job.name / "result.json").read_bytes() == before
     tasks = {"all": [DEMO[5], *tasks_of("teammate", "test_wide", "H1")[:1]]}
     for other in headroom_jobs(tasks, 1, TINY, tmp_path):

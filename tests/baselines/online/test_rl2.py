@@ -1,4 +1,4 @@
-"""RL^2: outputs over sequences and single steps, learning episodes, training and resume."""
+"""RL^2: model outputs, training episodes, resume, and the choice of teammates and layouts."""
 
 from __future__ import annotations
 
@@ -63,25 +63,25 @@ def teammates(count: int) -> dict[str, Policy]:
 def trainer() -> PlayTrainer:
     groups = make_groups({(LAYOUT, "assembly_line"): teammates(2)}, 8, {LAYOUT.name: 1.0})
     made = PlayTrainer(METHOD, OPTIONS, PLAY, groups, mirror=True)
-    made.init = jax.jit(made._initial_state)  # compiled once
+    made.init = jax.jit(made._initial_state)  # several tests call it
     return made
 
 
 @pytest.fixture(scope="module")
 def episode(trainer) -> Any:
-    """The compiled episode of the trainer's only player, which its steps play as well."""
+    """Return the compiled function by which the trainer's only player plays an episode."""
     trainer._compiled = trainer._compile(trainer.init(), jax.random.key(0))
     return trainer._compiled[0]
 
 
 @pytest.fixture(scope="module")
-def through(trainer, episode, tmp_path_factory) -> tuple[Path, Any]:
+def full_run(trainer, episode, tmp_path_factory) -> tuple[Path, Any]:
     folder = tmp_path_factory.mktemp("rl2") / "run"
     return folder, TrainingTask(METHOD, TrainingData(None, {}), OPTIONS, {}, trainer).train(folder)
 
 
-def test_the_memory_continues_over_steps_and_calls():
-    """A sequence gives equal outputs at once, in halves and step by step."""
+def test_sequence_outputs_equal_step_by_step_outputs():
+    """A sequence gives equal outputs in one call, in two halves and step by step."""
     rng = np.random.default_rng(0)
     steps = StepInput(
         jnp.asarray(rng.integers(0, 2, (6, 3, 5, 5, 46)), jnp.uint8),
@@ -106,11 +106,11 @@ def test_the_memory_continues_over_steps_and_calls():
         METHOD.loss(params, None, None, None)
 
 
-def test_episodes_for_learning(trainer, episode):
-    """Learning sequences contain the observations, actions and rewards of the played episode."""
+def test_training_sequences_match_the_played_episode(trainer, episode):
+    """Training sequences contain the actions and rewards of the played episode and the memory at its start."""
     player, state = trainer.players[0], trainer.init()
     tasks, key = state.tasks[0], jax.random.key(3)
-    for number in range(3):  # unfinished tasks continue in the next episode
+    for number in range(3):  # a task that has not ended continues in the next episode
         after, played, returns = episode(state.params, player.mates, tasks, jax.random.fold_in(key, number))
         assert played.action.shape == (100, 8)
         np.testing.assert_array_equal(played.seen.prev_action[1:], played.action[:-1])
@@ -121,21 +121,21 @@ def test_episodes_for_learning(trainer, episode):
         assert not memory[ended].any() and np.abs(memory[~ended]).sum() > 0
         np.testing.assert_array_equal(played.hidden[0], tasks.ego.state)
         for before in (after.before.prev_action, after.before.prev_reward, after.before.prev_teammate_action):
-            assert ended.any() and not np.asarray(before)[ended].any()  # a new task starts with empty memory
+            assert ended.any() and not np.asarray(before)[ended].any()  # new tasks have no previous step
         tasks = after
     changes = np.asarray(tasks.ego.change.upside_down), np.asarray(tasks.ego.change.sideways)
     assert all(0 < flags.sum() < 8 for flags in changes)
 
 
-def test_the_log(through):
-    lines = [json.loads(line) for line in (through[0] / "metrics.jsonl").read_text().splitlines()]
+def test_training_log_has_losses_and_falling_imitation_weight(full_run):
+    lines = [json.loads(line) for line in (full_run[0] / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == list(range(1, 7))
     assert [line["imitation_weight"] for line in lines] == pytest.approx(1 - np.arange(6) / 6)
     assert {"return cramped_up assembly_line", "policy_loss", "value_loss", "entropy", "loss"} <= lines[0].keys()
 
 
-def test_imitation_makes_oracle_actions_likelier(trainer, episode):
-    """On a fixed episode, the oracle's actions become likelier only with a positive imitation weight."""
+def test_imitation_loss_makes_oracle_actions_likelier(trainer, episode):
+    """On a fixed episode, only a positive imitation weight makes the oracle's actions likelier."""
     state = trainer.init()
     _, played, _ = episode(state.params, trainer._mates[0], state.tasks[0], jax.random.key(0))
     fallen = {}
@@ -151,7 +151,7 @@ def test_imitation_makes_oracle_actions_likelier(trainer, episode):
     assert fallen[0.0] < fallen[5.0] / 4
 
 
-def test_a_stopped_training_resumes_bit_for_bit(trainer, through, tmp_path):
+def test_stopped_rl2_training_resumes_bit_for_bit(trainer, full_run, tmp_path):
     def stop(step: int, loss: float | None) -> None:
         if step == 4:
             raise KeyboardInterrupt
@@ -160,12 +160,12 @@ def test_a_stopped_training_resumes_bit_for_bit(trainer, through, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         task.train(tmp_path, done=stop)
     state = task.train(tmp_path)
-    jax.tree.map(np.testing.assert_array_equal, state.params, through[1].params)
-    assert (tmp_path / "metrics.jsonl").read_bytes() == (through[0] / "metrics.jsonl").read_bytes()
+    jax.tree.map(np.testing.assert_array_equal, state.params, full_run[1].params)
+    assert (tmp_path / "metrics.jsonl").read_bytes() == (full_run[0] / "metrics.jsonl").read_bytes()
 
 
-def test_a_first_step_is_not_mirrored():
-    """Zeros mean "no previous action" at a task's first step, so mirroring keeps them; with two layers."""
+def test_previous_actions_of_a_first_step_are_not_mirrored():
+    """Zeros at the first step of a task mean "no previous action", so mirroring does not change these zeros."""
     flags = jnp.array([True, True])
     change = ViewChange(~flags, flags, flags)
     zero = jnp.zeros(2, jnp.int32)
@@ -183,8 +183,8 @@ def test_a_first_step_is_not_mirrored():
 
 
 @pytest.mark.slow
-def test_tasks_on_different_layouts_in_one_batch():
-    """Each task plays and learns as it does in a batch of its own layout."""
+def test_batch_of_several_layouts_gives_results_of_single_layouts():
+    """Tasks in a batch of several layouts have the results of a batch of one layout."""
     layouts = rearranged_layouts(LAYOUT, 3)[::2]
     mate = build_teammate(None, sample_teammate("assembly_line", 0, "train"))
     mixed = [
@@ -206,7 +206,7 @@ def test_tasks_on_different_layouts_in_one_batch():
 
 
 class TestGroups:
-    def test_shares(self):
+    def test_layouts_get_tasks_by_share_split_evenly_over_families(self):
         wide = get_layout("demo_wide")
         mates = {(LAYOUT, "a"): teammates(1), (LAYOUT, "b"): teammates(1), (wide, "a"): teammates(3)}
         groups = make_groups(mates, 40, {LAYOUT.name: 1.0, wide.name: 0.25}, hidden=[wide.name])
@@ -216,7 +216,7 @@ class TestGroups:
             ("demo_wide a", 8, True),
         ]
 
-    def test_every_teammate_has_several_behaviours(self):
+    def test_every_teammate_is_played_with_several_behaviours(self):
         group = make_groups({(LAYOUT, "a"): teammates(3)}, 60, {LAYOUT.name: 1.0})[0]
         found: dict[bytes, set[bytes]] = {}
         for mate in group.teammates:
@@ -224,24 +224,24 @@ class TestGroups:
             found.setdefault(theta, set()).add(np.asarray(mate.params["chances"]).tobytes())
         assert all(len(behaviours) >= 3 for behaviours in found.values())
 
-    def test_teammates_of_tasks(self):
+    def test_teammates_are_chosen_nearly_equally_often(self):
         assert sorted(np.bincount(chosen_teammates(3, 8)).tolist()) == [2, 3, 3]
         few = chosen_teammates(10, 4)
         assert len(set(few.tolist())) == 4 and few.max() < 10
 
-    def test_fewer_tasks_than_minibatches(self):
+    def test_fewer_tasks_than_minibatches_raise_error(self):
         groups = make_groups({(LAYOUT, "a"): teammates(1)}, 3, {LAYOUT.name: 1.0})
         with pytest.raises(OptionError, match=r"minibatches = 4: expected at most the 3 tasks .* --minibatches"):
             PlayTrainer(METHOD, OPTIONS, PlayOptions(minibatches=4), groups)
 
-    def test_mixture(self):
+    def test_mixture_of_behaviours_has_the_declared_shares(self):
         chances = mixed_chances(100)
         assert chances.shape == (100, len(BEHAVIOURS)) and np.allclose(chances.sum(axis=1), 1)
         assert (chances[:, 0] == 1).sum() == 100 * MIXTURE[0][0]
         assert mixed_chances(1)[0].tolist() == [1.0, 0.0, 0.0, 0.0]
 
-    def test_behaviours(self):
-        """The behaviour `stay` never moves; `script` plays like the teammate itself."""
+    def test_behaviours_change_the_actions_of_a_teammate(self):
+        """The behaviour `stay` never moves; the behaviour `script` plays the unchanged teammate."""
         (base,) = teammates(1).values()
         mates = with_behaviours([base] * len(BEHAVIOURS), np.eye(len(BEHAVIOURS), dtype=np.float32))
         (plain,), taken = played_actions([base]), dict(zip(BEHAVIOURS, played_actions(mates), strict=True))
@@ -252,7 +252,7 @@ class TestGroups:
 
 
 def played_actions(mates: list[Policy]) -> list[np.ndarray]:
-    """Return 40 actions of each teammate in the state at the start of an episode."""
+    """Return 40 actions of each teammate in the start state of an episode."""
     cells, facings = np.array(LAYOUT.agent_cells, np.uint8), np.zeros(2, np.uint8)
     record = jnp.asarray(start_record(LAYOUT, cells, facings, LAYOUT.recipe_items[0]))
     act = jax.jit(mates[0].act)
@@ -267,7 +267,7 @@ def played_actions(mates: list[Policy]) -> list[np.ndarray]:
 
 
 class TestPreparing:
-    """Choice of teammates from histories, other tasks and other layouts."""
+    """Preparation of RL^2 training: teammates and layouts from histories, manifests and rearranged layouts."""
 
     MODEL = dataclasses.replace(ModelOptions(**RL2_SETTINGS["model"]), width=8)
     CHOICE = HistoryOptions(("cramped_up",), source=("noise",), hide_recipe=("cramped_up",))
@@ -275,12 +275,12 @@ class TestPreparing:
     def prepare(self, play: PlayOptions, tasks: Any = (), choice: HistoryOptions = CHOICE, batch: int = 64) -> Any:
         return prepare_play("rl2", self.MODEL, TrainOptions(steps=1, batch_size=batch), play, choice, tasks)
 
-    def test_teammates_of_tasks_are_added_and_recorded(self):
+    def test_teammates_of_manifest_tasks_are_added_and_recorded(self):
         tasks = read_tasks(manifest_path("layout", "train", "diverse"))
         plain, job = (self.prepare(PlayOptions(), of, batch=128) for of in ((), tasks))
         assert plain.about["trained_on"] == [cell for cell in job.about["trained_on"] if cell["source"] != "tasks"]
         added = {cell["algorithm"]: cell for cell in job.about["trained_on"] if cell["source"] == "tasks"}
-        here = [task for task in tasks if task.layout.name == "cramped_up"]  # tasks on asymm_both are left out
+        here = [task for task in tasks if task.layout.name == "cramped_up"]  # others are on layouts that are not chosen
         assert sum(cell["tasks"] for cell in added.values()) == len(here)
         assert {cell["layout"] for cell in added.values()} == {"cramped_up"}
         ids = {teammate_id(task.teammate) for task in here}
@@ -289,8 +289,8 @@ class TestPreparing:
         assert seen.layouts == ("cramped_up",) and set(seen.teammates) >= set(added)
         assert sum(job.about["histories"]["groups"].values()) == job.trainer.tasks
 
-    def test_rearranged_layouts_are_played_too(self):
-        """All versions of a layout have equally many tasks over all families, up to one."""
+    def test_rearranged_and_four_recipe_layouts_are_added_in_proportion(self):
+        """The numbers of tasks of any two rearranged versions of a layout differ by at most one."""
         play = PlayOptions(rearranged=6, four_recipes=True)
         players = self.prepare(play).trainer.players
         groups = [group for player in players for group in player.groups]
@@ -302,13 +302,13 @@ class TestPreparing:
         assert tasks["cramped_up rearranged"] == pytest.approx(REARRANGED_SHARE * tasks["cramped_up"], abs=3)
         assert 0 < tasks["cramped_up four recipes"] < tasks["cramped_up"]
         rearranged = [group for group in groups if group.label == "cramped_up rearranged"]
-        families = {group.family for group in groups} - {"fcp"}  # learned teammates play only on their training layout
+        families = {group.family for group in groups} - {"fcp"}  # fcp teammates can only play their training layout
         assert {group.family for group in rearranged} == families
         played = collections.Counter(layout for group in rearranged for layout in group.layouts)
         assert {one.rows for one in played} == {one.rows for one in rearranged_layouts(LAYOUT, 6)}
         assert max(played.values()) - min(played.values()) <= 1
 
-    def test_layouts_without_histories_need_tasks(self):
+    def test_layout_without_histories_needs_tasks_of_a_manifest(self):
         choice = HistoryOptions(("cramped_down",))
         with pytest.raises(EmptySelectionError, match="cramped_down"):
             self.prepare(PlayOptions(), (), choice)
@@ -317,8 +317,8 @@ class TestPreparing:
         assert {cell["layout"] for cell in job.about["trained_on"]} == {"cramped_down"}
         assert job.about["histories"]["layouts"] == ["cramped_down"]
 
-    def test_tasks_keep_the_dish_that_their_teammate_wants(self):
-        """Both those of histories and those of a manifest."""
+    def test_tasks_keep_the_recipe_that_their_teammate_prefers(self):
+        """Check tasks chosen by histories, and tasks from a manifest."""
         name = "asymm_both_plain"
         tasks = [one for one in read_tasks(manifest_path("preference", "train")) if one.layout.name == name]
         of_histories = self.prepare(PlayOptions(), (), HistoryOptions((name,), source=("search",)), 256)
@@ -331,15 +331,15 @@ class TestPreparing:
 
     @pytest.mark.slow
     def test_teammates_on_rearranged_layouts_are_recorded(self):
-        """With few tasks, some teammates appear only on rearranged layouts."""
+        """In a small batch, some teammates appear only on rearranged layouts."""
         tasks = read_tasks(manifest_path("layout", "train", "diverse"))
         few = self.prepare(PlayOptions(minibatches=1), tasks, batch=2)
         job = self.prepare(PlayOptions(rearranged=6, minibatches=1), tasks, batch=2)
         counts = [sum(cell["tasks"] for cell in one.about["trained_on"]) for one in (few, job)]
         assert counts[0] < counts[1]
 
-    def test_shares_follow_the_measured_oracle_gain(self):
-        """The oracle earns more than `stay` with diverse teammates on demo_simple, not on coord_simple."""
+    def test_shares_of_layouts_depend_on_the_measured_oracle_gain(self):
+        """With diverse teammates, the oracle earns more than `stay` on demo_simple but not on coord_simple."""
         tasks = read_tasks(manifest_path("teammate", "train", "diverse"))
         assert _shares(None, [task for task in tasks if task.layout.name in ("demo_simple", "coord_simple")]) == {
             "coord_simple": FLAT_SHARE,
@@ -369,7 +369,7 @@ class TestPreparing:
             ),
         ],
     )
-    def test_invalid_choices_of_teammates(self, play, choice, manifest, message):
+    def test_invalid_choices_of_teammates_raise_errors(self, play, choice, manifest, message):
         tasks = read_tasks(manifest_path(*manifest)) if manifest else ()
         with pytest.raises(OptionError, match=message):
             self.prepare(play, tasks, choice)
@@ -377,7 +377,7 @@ class TestPreparing:
 
 class TestCommand:
     @pytest.mark.slow
-    def test_train_and_play(self, tmp_path):
+    def test_train_command_writes_a_model_that_can_be_loaded(self, tmp_path):
         out = tmp_path / "run"
         choice = "--layout cramped_up --source noise --teammate-family H3 --hide-recipe cramped_up"
         sizes = "--steps 1 --batch-size 2 --width 8 --epochs 1 --minibatches 1"
@@ -390,4 +390,4 @@ class TestCommand:
         assert agent.details and agent.details["sampled"] is True
         assert trained.hide_recipe == ("cramped_up",)
         task = published_task("cramped_down", "H1/t0")
-        prepare_rollout(agent.make, [task], get_protocol("seeded", 1))  # compiles
+        prepare_rollout(agent.make, [task], get_protocol("seeded", 1))  # raises if the policy does not fit the task

@@ -1,4 +1,4 @@
-"""Games of people and policies: the rules of an evaluation, partners by name, and policies in the other slot."""
+"""Games of people and policies: equal results to an evaluation, partners by name, and egos in the teammate slot."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ LAYOUT = get_layout("demo_wide")
 EPISODES, STEPS = 2, 60
 
 
-def test_a_game_equals_an_evaluation():
-    """The NumPy rules and one policy at a time give the returns of the compiled evaluation."""
+def test_game_of_two_policies_has_the_returns_of_an_evaluation():
+    """A game with the NumPy rules gives the returns of the compiled evaluation."""
     partner = find_partner("H4/t0", LAYOUT, 1)
     assert partner.task
     ego = find_partner("rl2-reference", LAYOUT, 0)
@@ -36,8 +36,8 @@ def test_a_game_equals_an_evaluation():
     np.testing.assert_array_equal(again.arrays()["state"], game.arrays()["state"])
 
 
-def test_an_ego_plays_the_other_agent():
-    """In the other slot an ego sees itself as agent 0, in a room that it can plan for."""
+def test_egos_can_play_in_the_teammate_slot():
+    """In the teammate's slot, an ego receives observations of this slot, and the oracle can plan and deliver."""
     seen = []
 
     def act(params, memory, view, key):
@@ -55,7 +55,7 @@ def test_an_ego_plays_the_other_agent():
     assert sum(Game(LAYOUT, cooking, task_key(0, "x"), 1, 100).play()) > 0
 
 
-def test_partners_by_name(tmp_path):
+def test_find_partner_accepts_known_names_only(tmp_path):
     assert find_partner("human", LAYOUT, 1).player is None
     with pytest.raises(UnknownNameError, match=r"valid: human, stay.*H1/t0.*Did you mean 'oracle'"):
         find_partner("orakel", LAYOUT, 1)

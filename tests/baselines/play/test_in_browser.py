@@ -1,4 +1,4 @@
-"""The page of `play` in headless Chromium, served by the command: keys, touch, a lost connection, the record."""
+"""The page of the command `play` in headless Chromium: keys, touch, a lost connection, and the recorded history."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STEPS = 12
 
 @pytest.fixture
 def served(tmp_path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """Serve a recorded game of one episode; yield the address of the page, and the process."""
+    """Serve a recorded game of one episode; yield the address of the page and the server process."""
     words = f"play --layout cramped_up --with H2/t3 --episodes 1 --steps {STEPS} --ticks 0 --port 0 --seed 3".split()
     command = [sys.executable, "-u", "-m", "icrl4aht_data", *words, "--record", str(tmp_path / "record")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
@@ -44,15 +44,15 @@ def served(tmp_path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
 
 @pytest.fixture
 def page(served) -> Iterator[Any]:
-    """The page on a phone."""
+    """Open the page of the game in a window of a phone's size."""
     with chromium() as open_page:
         page = open_page(served[0], PHONE, has_touch=True)
         wait_until(page, "setup !== undefined")
         yield page
 
 
-def test_a_game_in_the_browser(page, served, tmp_path):
-    """A person plays one recorded episode, and loses the connection in the middle of it."""
+def test_game_in_the_browser_is_recorded_despite_lost_connection(page, served, tmp_path):
+    """A person plays one recorded episode, and loses the connection in the middle of the episode."""
     assert page.locator("#game").is_hidden()
     page.fill("#pseudonym", "someone")
     page.check("#agrees")
@@ -65,7 +65,7 @@ def test_a_game_in_the_browser(page, served, tmp_path):
     for clock, name in enumerate(names, 1):
         page.keyboard.press(KEYS[name])
         wait_until(page, f"frame.clock === {clock}")
-        if (action := ACTIONS.index(name)) < len(FACING_OF):  # a move always turns
+        if (action := ACTIONS.index(name)) < len(FACING_OF):  # every move turns the agent
             assert page.evaluate("frame.record")[facing] == FACING_OF[action]
     page.tap("#pad [data-action=down]")
     wait_until(page, "frame.clock === 6")

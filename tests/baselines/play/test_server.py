@@ -1,4 +1,4 @@
-"""The websocket of a game, without a browser: keys, deliveries, records, lost connections, bad input."""
+"""The websocket of a game, tested without a browser: keys, records, lost connections and invalid input."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ORIGIN = {"origin": "http://127.0.0.1"}
 def new_session(
     partner: str = "stay", episodes: int = 2, steps: int = 8, record: Path | None = None, **options: Any
 ) -> PlaySession:
-    """Return a session of which a test takes every step, without egos to compare with."""
+    """Return a session that steps only when a test sends an action, without egos to compare with."""
     found = find_partner(partner, LAYOUT, 1)
     recorder, name = None, "a test"
     if record:
@@ -48,14 +48,14 @@ def new_session(
 
 
 class Browser:
-    """One connection: sends messages, and keeps the last state that was received."""
+    """A connection to the server that sends messages and stores the last received state."""
 
     def __init__(self, socket: Any) -> None:
         self.socket, self.setup = socket, socket.receive_json()
         self.frame: dict[str, Any] = socket.receive_json()
 
     def send(self, **message: Any) -> dict[str, Any]:
-        """Send a message, and return the answer."""
+        """Send a message to the server and return the answer."""
         self.socket.send_json(message)
         answer = self.socket.receive_json()
         if answer["kind"] == "frame":
@@ -77,13 +77,13 @@ def client_of(session: PlaySession) -> Any:
     return starlette.TestClient(make_app(session), base_url="http://127.0.0.1")
 
 
-def test_keys_move_the_agent():
+def test_keys_move_the_agent_by_the_rules():
     session = new_session()
     with client_of(session) as client, browser(client) as player:
         assert "arrow keys" in client.get("/").text
         assert player.setup["actions"] == list(ACTIONS)
         assert (player.frame["waiting"], player.frame["clock"]) == (True, 0)
-        player.act(STAY)  # says that someone is there, and is no step
+        player.act(STAY)  # the first key starts the episode without a step
         assert (player.frame["waiting"], player.frame["clock"]) == (False, 0)
         for action in (LEFT, RIGHT, UP, DOWN):
             before = np.array(player.frame["record"])
@@ -96,7 +96,7 @@ def test_keys_move_the_agent():
 
 
 def play_well(player: Browser, episodes: int, steps: int) -> None:
-    """Play with the oracle's actions, as a person with a plan would."""
+    """Play episodes with the oracle's actions in place of a person's keys."""
     plan = PolicyPlayer(oracle(LAYOUT), LAYOUT, EGO, is_ego=True)
     key, before = task_key(0, "plan"), (None,) * 5
     for episode in range(episodes):
@@ -106,19 +106,19 @@ def play_well(player: Browser, episodes: int, steps: int) -> None:
             player.act(plan.act(np.array(player.frame["record"], np.uint8), before, t))  # type: ignore[arg-type]
 
 
-def test_a_recorded_game(tmp_path):
-    """A delivery pays; the record is a release like any other, and holds what the person agreed to."""
+def test_recorded_game_is_a_valid_release(tmp_path):
+    """The record is a valid release with the person's pseudonym, which is written only after consent."""
     session = new_session("H2/t3", episodes=2, steps=100, record=tmp_path / "record")
     with client_of(session) as client, browser(client) as player:
         assert "Nothing else is stored" in player.setup["consent"]
-        player.socket.send_json({"action": LEFT})  # ignored before the consent
+        player.socket.send_json({"action": LEFT})  # the server ignores keys before the consent
         assert player.send(pseudonym="a@b.org", agrees=True)["kind"] == "problem"
         assert player.send(pseudonym="someone", agrees=False)["kind"] == "problem"
         assert not (tmp_path / "record").exists()
         assert player.send(pseudonym="someone", agrees=True)["consent"] is None
         player.frame = player.socket.receive_json()
         play_well(player, 1, 100)
-        assert load_icrl4aht(tmp_path / "record")[0].entry.episodes == 1, "each episode is written at once"
+        assert load_icrl4aht(tmp_path / "record")[0].entry.episodes == 1, "each episode is written when it ends"
         player.socket.send_json({"view": "whole"})
         play_well(player, 1, 100)
         assert player.frame["over"] and max(player.frame["returns"]) >= 20
@@ -139,7 +139,7 @@ def test_a_recorded_game(tmp_path):
         new_session("H2/t3", record=tmp_path / "record")
 
 
-def test_a_lost_connection_keeps_what_was_played():
+def test_game_continues_after_a_lost_connection():
     session = new_session(episodes=1)
     with client_of(session) as client:
         with browser(client) as player:
@@ -150,11 +150,11 @@ def test_a_lost_connection_keeps_what_was_played():
             assert player.frame["waiting"]
             player.act(STAY, *[STAY] * 5)
             assert player.frame["over"] and len(player.frame["returns"]) == 1
-            player.socket.send_json({"action": LEFT})  # no step after the end
+            player.socket.send_json({"action": LEFT})  # the server ignores keys after the last episode
             assert player.send(action="x")["kind"] == "problem"
 
 
-def test_a_failed_write_is_shown_and_repeated(tmp_path, monkeypatch):
+def test_failed_write_of_a_record_is_shown_and_repeated(tmp_path, monkeypatch):
     session = new_session("H2/t3", episodes=2, steps=3, record=tmp_path / "record")
     assert session.recorder
     session.recorder.pseudonym = "someone"
@@ -168,7 +168,7 @@ def test_a_failed_write_is_shown_and_repeated(tmp_path, monkeypatch):
     assert load_icrl4aht(tmp_path / "record")[0].entry.episodes == session.recorder.written == 2
 
 
-def test_two_people_see_themselves_as_the_blue_chef():
+def test_two_people_play_and_each_is_shown_as_agent_0():
     session = new_session("human")
     with client_of(session) as client, browser(client) as one:
         assert one.frame["missing"] == 1
@@ -180,7 +180,7 @@ def test_two_people_see_themselves_as_the_blue_chef():
                 pass
             assert closed.value.code == 4000
             assert one.send(action=STAY)["ready"]
-            assert two.socket.receive_json()["waiting"], "until both have pressed a key"
+            assert two.socket.receive_json()["waiting"], "the game waits until both people have pressed a key"
             assert not two.send(action=STAY)["waiting"]
             assert one.socket.receive_json()["clock"] == 0
             one.socket.send_json({"action": UP})
@@ -192,10 +192,10 @@ def test_two_people_see_themselves_as_the_blue_chef():
             assert two.setup["slot"] == 1
 
 
-def test_steps_by_the_clock_and_their_latency():
-    """A step takes 50 ms or less from the key to the new state; without keys the game goes on."""
+def test_steps_are_fast_and_can_follow_a_clock():
+    """The median step takes at most 50 ms from the key to the new state; with a clock, steps need no keys."""
     session = new_session("H1/t0", episodes=1, steps=40)
-    session.game.with_players(session.game.players).step({})  # as the command does before it serves
+    session.game.with_players(session.game.players).step({})  # compile the policies first, as the command does
     with client_of(session) as client, browser(client) as player:
         player.act(STAY, STAY)
         seconds = []
@@ -211,14 +211,14 @@ def test_steps_by_the_clock_and_their_latency():
         assert player.frame["clock"] == 5
 
 
-def test_comparison_with_egos():
+def test_session_compares_the_person_with_reference_egos():
     session = new_session("H4/t0", compared=("stay", "oracle"), episodes=1, steps=100)
     session.compare(lambda: None)
     assert session.references["stay"] == [0.0]
     assert session.references["oracle"][0] > 0
 
 
-def test_pages_of_other_sites_are_refused():
+def test_requests_from_other_websites_are_refused():
     with client_of(new_session()) as client:
         with (
             pytest.raises(starlette.WebSocketDisconnect),
@@ -228,7 +228,7 @@ def test_pages_of_other_sites_are_refused():
         assert client.get("/", headers={"host": "evil.example"}).status_code == 400
 
 
-def test_bad_input(tmp_path):
+def test_play_command_rejects_invalid_options(tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").touch()
     record = ("--record", str(tmp_path / "new"))

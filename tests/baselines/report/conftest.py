@@ -1,4 +1,4 @@
-"""Best responses for tests of scores, which do not depend on the package's."""
+"""Invented best responses, so that tests of scores do not depend on those of the package."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def cards(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module", autouse=True)
 def unmeasured(cards) -> Iterator[None]:
-    """Replace the package's best responses by none."""
+    """Replace the package's best responses by an empty set."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(best_responses, "best_responses_file", lambda: cards / "none.json")
         yield
@@ -30,5 +30,5 @@ def unmeasured(cards) -> Iterator[None]:
 
 @pytest.fixture
 def measured(unmeasured, cards, monkeypatch) -> None:
-    """Replace the package's best responses by those of `write_measured`."""
+    """Replace the package's best responses by the invented ones of `write_measured`."""
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "measured.json")

@@ -1,4 +1,4 @@
-"""docs/results.md: stored results, the tables computed from hand-made returns, and the committed page."""
+"""The page docs/results.md: stored results, tables computed from invented returns, and the committed page."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LOW, HIGH = [0.0] * 5 + [10.0] * 95, [10.0] * 5 + [20.0] * 95
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory) -> Path:
-    """Return results on the layout track: of an agent that needs its memory, and of a lower one."""
+    """Write results on the layout track of two agents: `high`, which needs its memory, and `low`."""
     folder = tmp_path_factory.mktemp("results")
     write_results(folder / "high", "high", HIGH, offset=1.0)
     write_results(folder / "high" / "cleared", "high (cleared)", [5.0] * 100, offset=0.5, forget=True)
@@ -49,10 +49,10 @@ def row(table: str, agent: str) -> list[str]:
     return [cell.strip() for cell in line.strip("|").split(" | ")]
 
 
-def test_stored_results_have_blocks_and_curves(stored, tmp_path):
+def test_stored_results_have_blocks_and_curves_and_can_be_read_again(stored, tmp_path):
     assert len(stored.table) == 4 * 40 * 3 * 6 and len(stored.curves) == 4 * 2 * 100
     curve = stored.curves[(stored.curves["agent"] == "high") & (stored.curves["control"] == "")]
-    assert curve["return"].tolist() == [value + 2.0 for value in HIGH] * 2, "mean over t0 to t4"
+    assert curve["return"].tolist() == [value + 2.0 for value in HIGH] * 2, "mean over the five teammates"
     comparison.write_stored(tmp_path / "results.json", stored)
     again = comparison.read_stored(tmp_path / "results.json")
     assert again.agents == stored.agents
@@ -60,12 +60,12 @@ def test_stored_results_have_blocks_and_curves(stored, tmp_path):
     pd.testing.assert_frame_equal(again.curves, stored.curves, check_dtype=False)
 
 
-def test_table_1_has_scores_of_complete_tracks(stored, measured):
+def test_agents_table_has_scores_of_complete_tracks_only(stored, measured):
     scales = cell_scales("seeded")
     table = comparison.agents_table(stored, stored.returns(), scales)
     high, low = row(table, "high"), row(table, "low")
     assert high[1:6] == ["noise", "oracle", "10 updates, 2 core-hours", "–", "–"], "no track teammate"
-    # R - S over B - S = 20, with S = 12.0 on asymm_right in the mean and 0.0 on cramped_down
+    # Score: (return - stay) / 20; the mean return of `stay` is 12.0 on asymm_right and 0.0 on cramped_down.
     stays = np.mean([np.mean([scale.stay for cell, scale in scales.items() if cell.layout == name])
                      for name in ("asymm_right", "cramped_down")])  # fmt: skip
     for found, mean in ((high, 21.5), (low, 9.5)):
@@ -73,7 +73,7 @@ def test_table_1_has_scores_of_complete_tracks(stored, measured):
     assert comparison.describe_lead(stored.returns(), scales) == "No two models have a score on the track `teammate`."
 
 
-def test_the_lead_is_the_difference_of_the_two_highest(tmp_path, measured):
+def test_lead_is_the_difference_of_the_two_highest_scores(tmp_path, measured):
     found = StoredResults()
     for name, value in {"a": 3.0, "b": 9.0, "c": 5.0}.items():
         folder = write_results(tmp_path / name, name, [value] * 100, track="teammate")
@@ -81,7 +81,7 @@ def test_the_lead_is_the_difference_of_the_two_highest(tmp_path, measured):
     assert "`b` minus `c` is +0.20 (+0.20 to +0.20)" in comparison.describe_lead(found.returns(), cell_scales("seeded"))
 
 
-def test_table_2_has_the_controls_and_blocks(stored, measured):
+def test_controls_table_has_memory_and_partner_controls_and_blocks(stored, measured):
     table = comparison.controls_table(stored, stored.returns(), cell_scales("seeded"))
     high, low = row(table, "high"), row(table, "low")
     assert high[1].startswith("**+15.5 (") and high[1].endswith(")**"), "19.5 + 2 - (5 + 1)"
@@ -89,7 +89,7 @@ def test_table_2_has_the_controls_and_blocks(stored, measured):
     assert low[1:] == ["–", "–", "0.0", "0.0", "10.0", "10.0"]
 
 
-def test_table_3_has_reference_egos_and_layouts(stored, measured):
+def test_layouts_table_has_reference_egos_and_returns_by_layout(stored, measured):
     table = comparison.layouts_table(stored.returns(), cell_scales("seeded"))
     assert row(table, "stay")[1:4] == ["12.8", "13.0", "12.7"] and "| best response | 12.8 | 18.0 |" in table
     low = row(table, "low")
@@ -99,7 +99,7 @@ def test_table_3_has_reference_egos_and_layouts(stored, measured):
     assert row(none, "low")[7:] == ["9.5", "9.5", "–", "–"] and "| best response | – |" in none
 
 
-def test_best_responses_of_a_layout_count_as_stay_in_cells_without_one(measured):
+def test_mean_best_uses_stay_for_families_without_best_response(measured):
     scales, stay = cell_scales("seeded"), read_headroom("seeded")
     ring = [cell for cell in scales if cell.layout == "coord_ring"]
     h2 = next(cell for cell in ring if cell.family == "H2")
@@ -108,7 +108,7 @@ def test_best_responses_of_a_layout_count_as_stay_in_cells_without_one(measured)
     assert comparison.mean_best("coord_ring", {cell: scales[cell] for cell in scales if cell not in ring}) is None
 
 
-def test_the_page_without_and_with_best_responses(stored, tmp_path, cards, monkeypatch):
+def test_results_page_is_written_with_and_without_best_responses(stored, tmp_path, cards, monkeypatch):
     old = stored.agents | {"low": AgentFacts("an old one", "noise", "oracle", commit="71f723c")}
     some = dataclasses.replace(stored, agents=old)
     paths = comparison.write_comparison(some, tmp_path / "page")
@@ -123,14 +123,14 @@ def test_the_page_without_and_with_best_responses(stored, tmp_path, cards, monke
     down = table[table["layout"] == "cramped_down"]
     assert len(table) == len(stored.table) and set((down["best"] - down["stay"]).dropna()) == {20}
     mixed = table[table["control"] == "swapped"]
-    assert set(mixed.loc[mixed["best"].notna(), "block"]) == {"last 20"}, "others are of another teammate"
+    assert set(mixed.loc[mixed["best"].notna(), "block"]) == {"last 20"}, "others have another teammate"
     assert "20 of 32 cells" in comparison.render_comparison(some)
     with pytest.raises(OptionError, match="no stored results: give files that"):
         comparison.write_comparison(StoredResults(), tmp_path / "empty")
 
 
 @pytest.mark.parametrize("texts", ["{", "[]", '{"a": {}}', "{}"])
-def test_damaged_stored_results(texts, tmp_path):
+def test_damaged_stored_results_raise_error(texts, tmp_path):
     assert len(comparison.read_stored(tmp_path / "none.json").table) == 0
     (tmp_path / "bad.json").write_text(texts)
     (tmp_path / "bad.csv").write_text("agent,protocol\n")
@@ -138,7 +138,7 @@ def test_damaged_stored_results(texts, tmp_path):
         comparison.read_stored(tmp_path / "bad.json")
 
 
-def test_bundled_results_are_in_canonical_form(tmp_path):
+def test_bundled_results_are_unchanged_if_written_again(tmp_path):
     comparison.write_stored(tmp_path / "results.json", comparison.read_stored(comparison.results_file()))
     for name in ("results.json", "results.csv.gz", "results_curves.csv.gz"):
         opened = gzip.open if name.endswith(".gz") else open
@@ -147,7 +147,7 @@ def test_bundled_results_are_in_canonical_form(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_committed_page_matches_the_stored_results(monkeypatch):
+def test_committed_results_page_matches_the_stored_results(monkeypatch):
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: card_file("best_responses.json"))
     stored = comparison.read_stored(comparison.results_file())
     assert (ROOT / "docs" / "results.md").read_text(encoding="utf-8") == comparison.render_comparison(stored)

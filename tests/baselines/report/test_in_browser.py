@@ -1,4 +1,4 @@
-"""The page of a report in headless Chromium at the width of a phone."""
+"""The HTML report in headless Chromium at the width of a phone."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ pytestmark = [pytest.mark.slow, NEEDS_CHROMIUM]
 TOO_WIDE = """(width) => [...document.body.querySelectorAll("*")]
     .filter((element) => !element.closest(".wide, svg") && element.getBoundingClientRect().right > width + 0.5)
     .map((element) => element.outerHTML.slice(0, 100))"""
-"""Elements that end beyond the page; tables in `.wide` have a scroll bar of their own."""
+"""JavaScript function: elements that extend beyond the page's width, except tables in `.wide`, which can scroll."""
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory) -> Path:
-    """Write a page with every section: all layouts, long names and pictures of episodes."""
+    """Write a report with every section, all layouts, long names and pictures of episodes; return its path."""
     folder = tmp_path_factory.mktemp("report")
     Image.fromarray(np.zeros((400, 900), np.uint8)).save(folder / "a.gif")
     runs = [evaluated_run(name, TEST_LAYOUTS, protocol="published") for name in ("AD", "random")]
@@ -38,7 +38,7 @@ def file(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("dark", [False, True])
-def test_a_phone_does_not_scroll_sideways(file, dark):
+def test_report_fits_the_width_of_a_phone(file, dark):
     with chromium() as open_page:
         page = open_page(file.as_uri(), PHONE, dark)
         page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true })")

@@ -1,4 +1,4 @@
-"""The HTML page, the Markdown report and cards: complete, self-contained, names escaped."""
+"""The HTML report, the Markdown report and cards: complete content, no external files, escaped names."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from icrl4aht_data.errors import OptionError
 from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 
-GIF = b"GIF89a"  # the page does not decode the image
+GIF = b"GIF89a"  # no complete image, since the report does not decode it
 EVIL = '<img src=x onerror="alert(1)">&co'
 
 
 class Elements(HTMLParser):
-    """Parser that collects external addresses, scripts and images of a page."""
+    """An HTML parser that collects external addresses, scripts and images of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ class Elements(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_is_complete_and_fetches_nothing(tmp_path):
+def test_html_report_is_complete_and_loads_no_external_files(tmp_path):
     runs = [evaluated_run(name, TEST_LAYOUTS, protocol="published") for name in ("AD", "random")]
     runs.append(evaluated_run("AD", protocol="published", note="K250"))
     (tmp_path / "a.gif").write_bytes(GIF)
@@ -77,22 +77,22 @@ def test_the_page_is_complete_and_fetches_nothing(tmp_path):
         write_page([], tmp_path / "report.html")
 
 
-def test_names_are_escaped_in_all_reports(tmp_path):
+def test_html_in_names_is_escaped_in_all_reports(tmp_path):
     run = trained(evaluated_run(EVIL, folder=EVIL), layers=2)
     text = write_page([run], tmp_path / "report.html").read_text()
     assert Elements(text).outside == [] and EVIL not in text and EVIL in unescape(text)
     text = markdown([run])
     assert "<img" not in text and '&lt;img src=x onerror="alert(1)"&gt;&amp;co' in text
-    assert "<br>episodes 1: 10.0, " in text, "line breaks in cells stay"
+    assert "<br>episodes 1: 10.0, " in text, "line breaks in table cells are not escaped"
 
 
-def test_the_page_names_conditions_once_and_marks_overlaps(tmp_path):
+def test_html_report_names_conditions_once_and_marks_overlaps(tmp_path):
     record = [{"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["00"]}]
     runs = [evaluated_run("AD", trained_on=record), evaluated_run("mine", trained_on=None)]
     text = unescape(write_page(runs, tmp_path / "report.html").read_text())
     assert text.count("Evaluated under protocol seeded, 1 seed (0), 40 episodes of 100 steps; 5 instances") == 1
     assert text.count('<i class="key"></i>AD †</span>') == text.count('<i class="key"></i>mine ?</span>') == 2
-    (chart,) = bar_charts(dict(enumerate(runs)), "seeded")  # of returns, no best response is measured
+    (chart,) = bar_charts(dict(enumerate(runs)), "seeded")  # shows returns, since no best response is measured
     marks = [[bar.text.lstrip("-0123456789.") for bar in row.bars] for row in chart.bars["demo_wide"]]
     assert marks == [["", "?"]] * 3 + [["†", "?"]]
     short = evaluated_run("DPT", steps=20)
@@ -100,7 +100,7 @@ def test_the_page_names_conditions_once_and_marks_overlaps(tmp_path):
     assert "Evaluated AD and mine under protocol seeded, 1 seed (0), 40 episodes of 100 steps; DPT under" in text
 
 
-def test_without_scores_there_are_no_columns_of_scores(tmp_path):
+def test_html_report_without_scores_has_no_score_columns(tmp_path):
     runs = [evaluated_run(name) for name in ("one", "two")]
     source = runs[0].sources[0]
     runs[0] = dataclasses.replace(runs[0], sources=(source._replace(settings=source.settings | {"seeds": [0, 1, 2]}),))
@@ -109,7 +109,7 @@ def test_without_scores_there_are_no_columns_of_scores(tmp_path):
     assert "one under protocol seeded, 3 seeds (0 to 2), 40 episodes" in text
 
 
-def test_bars_run_from_stay_to_the_score(measured, tmp_path):
+def test_score_bars_start_at_the_return_of_stay(measured, tmp_path):
     run = evaluated_run("mine", ("coord_simple", "demo_wide"), value=9.0)
     (chart,) = bar_charts({0: run}, "seeded")
     (rows,) = chart.bars.values()
@@ -131,7 +131,7 @@ def test_bars_run_from_stay_to_the_score(measured, tmp_path):
     assert '<td data-label="regret">10.0</td>' in text and '<td data-label="regret">–</td>' in text
 
 
-def test_curves_share_their_axes_and_may_have_one_episode():
+def test_curves_share_axes_and_can_have_one_episode():
     run = evaluated_run("mine", value=40.0)
     (chart,) = curve_charts({0: run})
     assert [tick.label for tick in chart.y_ticks] == ["0", "10", "20", "30", "40"] and len(chart.panels) == 4
@@ -141,7 +141,7 @@ def test_curves_share_their_axes_and_may_have_one_episode():
 
 
 def trained(run: EvaluationRun, **model) -> EvaluationRun:
-    """Return the results with a training record that lists the layouts in the agent's name."""
+    """Add a training record on the run's layouts to the results of an evaluation."""
     histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": [*run.sources[0].layouts], "data_version": "1.0.0"}
     histories |= {"sizes": {"train": 14}, "queries": 201, "every": 1, "labels": "oracle"}
     config = {"method": "dpt", "model": model, "train": {"seed": 3}, "package_version": "0", "histories": histories}
@@ -149,8 +149,8 @@ def trained(run: EvaluationRun, **model) -> EvaluationRun:
     return dataclasses.replace(run, sources=tuple(source._replace(trained=content) for source in run.sources))
 
 
-def test_cards_say_what_a_model_was_trained_on():
-    """Cards of the bundled models, and of models trained on a release of the Hub and on a local one."""
+def test_model_cards_describe_the_training_data():
+    """Cards of the bundled models contain the sentence on training data that their configuration gives."""
     for name in ("ad-reference", "ad-rising", "dpt-reference", "rl2-reference"):
         configs = [json.loads((MODELS / name / track / "config.json").read_text()) for track in TRACKS]
         card = (MODELS / name / "README.md").read_text(encoding="utf-8")
@@ -163,7 +163,7 @@ def test_cards_say_what_a_model_was_trained_on():
     )
 
 
-def test_headroom_cards_name_cells_without_headroom(tmp_path):
+def test_headroom_card_lists_layouts_and_families_without_headroom(tmp_path):
     values = {"stay": (40.0, 0.0), "random": (35.0, 0.0), "oracle": (40.5, 39.9)}
     runs = []
     for agent, (simple, wide) in values.items():
@@ -176,8 +176,8 @@ def test_headroom_cards_name_cells_without_headroom(tmp_path):
     assert "**0.0 / 0.0 / 39.9**" in text and "No headroom: coord_simple/H1, coord_simple/H2" in text
 
 
-def test_shown_episodes_prefer_cells_with_headroom(measured, tmp_path, monkeypatch):
-    """Tasks with headroom come first, reference egos last."""
+def test_shown_episodes_are_of_tasks_with_headroom(measured, tmp_path, monkeypatch):
+    """Episodes are shown for layouts and families with headroom, and not for reference egos."""
     (tmp_path / "a.gif").write_bytes(GIF)
     monkeypatch.setattr(gifs, "save_episodes", lambda *a, **k: (ShownEpisode(1, 7.0, tmp_path / "a.gif"),))
     monkeypatch.setattr(gifs, "restore_ego", lambda source: source)
@@ -198,7 +198,7 @@ def test_shown_episodes_prefer_cells_with_headroom(measured, tmp_path, monkeypat
     assert 'id="episodes"' not in write_page_with_episodes(runs, path, episodes=False).read_text()
 
 
-def test_egos_that_cannot_be_loaded_give_a_reason(tmp_path):
+def test_restoring_an_unknown_or_missing_ego_raises_error(tmp_path):
     source = evaluated_run("AD").sources[0]
     with pytest.raises(OptionError, match="AD is neither a reference ego, nor a bundled model, nor of a run folder"):
         restore_ego(source)
@@ -206,8 +206,8 @@ def test_egos_that_cannot_be_loaded_give_a_reason(tmp_path):
         restore_ego(source._replace(trained={"run": str(tmp_path / "gone")}))
 
 
-def test_commands_with_a_custom_manifest(tmp_path, monkeypatch):
-    """Evaluate, print the summary, and draw the first and last episode with the stored returns."""
+def test_evaluate_and_report_commands_accept_a_custom_manifest(tmp_path, monkeypatch):
+    """The HTML report shows the first and last episode of each task with the stored returns."""
     theta = next(task for task in TEST_TASKS if task.teammate_family == "H4").teammate
     write_tasks(tmp_path / "own.jsonl", [make_task("teammate", "train", "demo_wide", theta | {"theta_id": 77}, 5)])
     monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded").__class__("seeded", "seeded", False, 3, 5))

@@ -1,4 +1,4 @@
-"""Results in one table: cells, kinds of tasks, overlap with training data, merged runs."""
+"""The table of results: kinds of tasks, blocks of episodes, overlap with training data, and merged runs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ TASKS: dict[str, list[Task]] = {
 LAYOUT_TEST = [task for task in TEST_TASKS if task.layout.name == "asymm_right" and task.teammate_family == "H1"]
 
 
-def test_a_table_has_a_row_for_each_task_seed_and_block():
+def test_results_table_has_a_row_for_each_task_seed_and_block():
     tasks = [task for task in TEST_TASKS if task.layout.name == "demo_wide" and task.teammate_family == "H4"][:2]
     settings = {"agent": "mine", "seeds": [3, 4], "protocol": asdict(get_protocol("seeded", 5)), "code_version": "0"}
     returns = [[[1.0, 2, 3, 5, 8], [0.0] * 5], [[10.0] * 5, [20.0] * 5]]
@@ -59,7 +59,7 @@ def test_a_table_has_a_row_for_each_task_seed_and_block():
         as_run([Result(tasks[0].task_id, settings, [[1.0]]), Result(tasks[1].task_id, {}, [[1.0]])])
 
 
-def test_blocks_of_long_and_short_evaluations():
+def test_episode_blocks_of_long_and_short_evaluations_are_means():
     found = {episodes: episode_blocks(np.arange(1.0, 1 + episodes)) for episodes in (1, 5, 20, 30, 100)}
     assert list(found[100]) == [*BLOCKS] and list(found[20]) == ["all", "1", "2-5", "6-20"]
     assert list(found[5]) == ["all", "1", "2-5"] and list(found[1]) == ["all", "1"]
@@ -68,7 +68,7 @@ def test_blocks_of_long_and_short_evaluations():
 
 
 @pytest.mark.parametrize("kind", TASKS)
-def test_kinds_of_tasks_never_share_a_cell(kind):
+def test_results_of_different_kinds_of_tasks_are_kept_apart(kind):
     (task,) = TASKS[kind]
     cell = cell_of(task)
     assert cell.kind == kind and cell.title.endswith("H4" if kind == "test" else f" ({kind})")
@@ -89,21 +89,21 @@ def test_kinds_of_tasks_never_share_a_cell(kind):
         (LAYOUT_TEST, [{"layout": "asymm_right", "family": "rl", "algorithm": "fcp", "teammates": []}], ["layout"]),
     ],
 )
-def test_overlaps_of_training_and_tasks(tasks, record, expected):
-    """Training on a test layout is an overlap only in the layout track."""
+def test_overlap_of_training_data_and_tasks_is_reported(tasks, record, expected):
+    """Training on a test layout counts as overlap only in the layout track."""
     entries = None if record is None else [{"layout": "demo_wide", **entry} for entry in record]
     run = evaluated_run("AD", tasks=tasks, trained_on=entries)
     assert set(run.table["overlap"]) == {" ".join(expected)}
     assert set(expected) <= set(OVERLAPS)
 
 
-def test_only_reference_egos_may_have_no_training_record():
+def test_results_without_training_record_are_allowed_for_reference_egos():
     assert set(evaluated_run("stay", trained_on=None).table["overlap"]) == {""}
     with pytest.raises(OptionError, match=r"runs/mine: trained_on: expected a layout, a family"):
         evaluated_run("mine", trained_on=[{"layout": "demo_wide"}])
 
 
-def test_models_of_different_layouts_are_one_agent():
+def test_runs_of_one_agent_on_different_layouts_are_merged():
     one, two = evaluated_run("AD", ("demo_wide",)), evaluated_run("AD", ("coord_simple",))
     (both,) = merge([one, two])
     assert next(iter(both.cells)) == ResultCell("coord_simple", "H1") and len(both.cells) == 8
@@ -111,7 +111,7 @@ def test_models_of_different_layouts_are_one_agent():
     assert [source.layouts for source in both.sources] == [("demo_wide",), ("coord_simple",)]
 
 
-def test_results_of_other_conditions_are_not_merged():
+def test_runs_of_other_conditions_or_same_tasks_are_not_merged():
     one = evaluated_run("AD", acting="cached")
     for other, label in (
         (evaluated_run("AD", value=3.0), "AD [runs/AD]"),
@@ -125,8 +125,8 @@ def test_results_of_other_conditions_are_not_merged():
     )
 
 
-def test_results_are_kept_for_each_track(tmp_path):
-    """A bundled model has separate parameters and training data for each track."""
+def test_sources_of_results_are_separate_for_each_track(tmp_path):
+    """A bundled model has different parameters and training data for each track."""
     record = {"teammate": [{"layout": "demo_wide", "family": "H4"}], "layout": []}
     run = evaluated_run("ad-reference", ("demo_wide", "cramped_down"), details={"trained_on": record}, trained_on=None)
     assert [source.layouts for source in run.sources] == [("demo_wide",), ("cramped_down",)]

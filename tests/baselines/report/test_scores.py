@@ -1,4 +1,4 @@
-"""Scores relative to best responses, tables, the summary and the paper's numbers, against hand-made values."""
+"""Scores relative to best responses, tables, summaries and the paper's numbers, compared with known values."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WIDE, RING, FLAT = ResultCell("demo_wide", "H1"), ResultCell("coord_ring", "H2")
 
 
 def returns_of(*values: float, seeds: int = 3) -> CellReturns:
-    """Return results of tasks t0, t1 and so on in which every seed earns the same."""
+    """Return invented results of tasks t0, t1 and so on; all seeds of a task earn the same."""
     found = np.repeat(np.array(values)[None, :, None], seeds, axis=2)
     tasks = tuple(f"t{number}" for number in range(len(values)))
     return CellReturns(tasks, tuple(range(seeds)), {"all": found, "last 20": found + 1})
@@ -41,24 +41,24 @@ SCALES = {
 }
 
 
-def test_a_score_is_a_ratio_of_sums_by_layout():
+def test_score_is_a_ratio_of_sums_on_each_layout():
     cells = {WIDE: returns_of(5.0, 15.0, 0.0, 10.0), RING: returns_of(10.0, 10.0, 7.0), FLAT: returns_of(99.0)}
-    assert scores.open_cells(SCALES) == [RING, WIDE], "FLAT has less than 5 points of headroom"
+    assert scores.open_cells(SCALES) == [RING, WIDE], "FLAT has headroom of less than 5"
     score = scores.find_score(cells, [RING, WIDE], SCALES)
     assert score is not None
     wide, ring = (5 + 10 + 0 + 10) / (10 + 20 + 10 + 10), 27 / 81
     assert score.layouts == pytest.approx({"coord_ring": ring, "demo_wide": wide})
     assert score.total.mean == pytest.approx((wide + ring) / 2)
-    # Behaviours: d and e 0.25, a and b 0.5, c (0 + 10) / 20; f has no headroom of its own.
+    # Scores of behaviours: 0.25 for d and e, 0.5 for a and b, (0 + 10) / 20 for c; f has too little headroom.
     assert score.middle.mean == pytest.approx((0.25 + 0.5 + 0.5) / 3) and score.worst == ("coord_ring H2", 0.25)
     assert score.regret == pytest.approx(((50 - 25) + (81 - 27)) / 7)
     assert scores.find_score(cells, [RING, FLAT], SCALES) is None and scores.find_score(cells, [], SCALES) is None
     assert scores.find_score({WIDE: returns_of(5.0, 5.0)}, [WIDE], SCALES) is None, "tasks are missing"
 
 
-def test_differences_are_paired_by_task_and_seed():
+def test_score_differences_are_paired_by_task_and_seed():
     one, other = returns_of(5.0, 15.0, 0.0, 10.0), returns_of(10.0, 0.0, 10.0, 15.0, seeds=1)
-    shuffled = other._replace(tasks=("t3", "t2", "t0", "t1"))  # 10.0 is of t3
+    shuffled = other._replace(tasks=("t3", "t2", "t0", "t1"))  # task t3 earns 10.0
     difference = scores.score_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], SCALES)
     assert difference.mean == pytest.approx(((5 - 10) + (15 - 15) + (0 - 0) + (10 - 10)) / 50)
     returns = scores.block_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], "last 20")
@@ -67,8 +67,8 @@ def test_differences_are_paired_by_task_and_seed():
     assert scores.block_difference({WIDE: one}, {WIDE: other}, [WIDE], "1") is None
 
 
-def test_teammates_that_behave_alike_are_one_unit():
-    """The interval of five equal teammates is that of their seeds."""
+def test_teammates_with_equal_behaviour_count_as_one_unit():
+    """The interval over five teammates with equal behaviour is the interval over the seeds of one teammate."""
     alike = {WIDE: scale_of(*[(0.0, 20.0, "same")] * 5)}
     values = np.broadcast_to([2.0, 4.0, 6.0, 8.0], (1, 5, 4))
     found = CellReturns(tuple(f"t{number}" for number in range(5)), (0, 1, 2, 3), {"all": values})
@@ -79,8 +79,8 @@ def test_teammates_that_behave_alike_are_one_unit():
     assert single and single.total == pytest.approx(pair[0].total) and pair[0].total.range()
 
 
-def test_a_layout_counts_once_all_of_its_cells_are_measured(measured, monkeypatch, tmp_path):
-    """Without the best response to one teammate of H1 on demo_wide the other layouts remain."""
+def test_layout_with_a_missing_best_response_has_no_score(measured, monkeypatch, tmp_path):
+    """If one best response on demo_wide is missing, scores exist for all other layouts."""
     card = read_best_responses(best_responses.best_responses_file())
     lacks = next(one for one in card.behaviours if (one.layout, one.family) == ("demo_wide", "H1"))
     kept = tuple(one for one in card.behaviours if one != lacks)
@@ -90,7 +90,7 @@ def test_a_layout_counts_once_all_of_its_cells_are_measured(measured, monkeypatc
     assert len(found) == 16 and "demo_wide" not in {cell.layout for cell in found}
 
 
-def test_scales_have_the_tasks_with_a_best_response(measured):
+def test_score_scales_cover_all_tasks_with_a_best_response(measured):
     scales = scores.cell_scales("seeded")
     assert (
         len(scores.open_cells(scales)) == 20
@@ -102,7 +102,7 @@ def test_scales_have_the_tasks_with_a_best_response(measured):
     assert {*scales[WIDE].tasks} == {task_label(task) for task in scores.bundled_cells()[WIDE]}
 
 
-def test_damaged_best_responses(tmp_path):
+def test_damaged_file_of_best_responses_raises_error(tmp_path):
     with pytest.raises(OptionError, match=r"none\.json: no such file, expected best responses"):
         read_best_responses(tmp_path / "none.json")
     card = read_best_responses(write_measured(tmp_path / "b.json"))
@@ -116,7 +116,7 @@ def test_damaged_best_responses(tmp_path):
         read_best_responses(tmp_path / "bad.json")
 
 
-def test_the_summary_of_a_run(measured):
+def test_summary_of_a_run_has_score_and_return_by_episode(measured):
     (found,) = scores.find_headlines(evaluated_run("mine", ("coord_simple", "demo_wide")))
     assert found.score and found.score.total[:3] == pytest.approx((11.0 / SPAN,) * 3), "equal instances"
     assert found.text == (
@@ -126,7 +126,7 @@ def test_the_summary_of_a_run(measured):
     )
 
 
-def test_results_without_a_score_say_why(measured):
+def test_results_without_a_score_have_a_reason(measured):
     (short,) = scores.find_headlines(evaluated_run("mine", steps=20))
     assert short.score is None and short.why_no_score.startswith("No score: it needs all tasks of a cell with a best")
     (flat,) = scores.find_headlines(evaluated_run("mine", ("coord_simple",)))
@@ -135,13 +135,13 @@ def test_results_without_a_score_say_why(measured):
     assert published.why_no_score == "No score: best responses were measured under protocol seeded."
 
 
-def test_other_episode_lengths_have_no_paper_numbers():
+def test_results_of_other_episode_lengths_show_no_paper_numbers():
     run = evaluated_run("AD", protocol="published", steps=20)
     found = page.table_score(DEMO_WIDE[:1], run, "published", (1.0, 1.0))
     assert found.notes == ["episodes 1: 10.0, 2-5: 10.0, 6-20: 10.0, 21-100: 12.0"]
 
 
-def test_tables_have_our_and_the_papers_numbers():
+def test_returns_tables_have_our_numbers_and_the_papers():
     runs = [evaluated_run(agent, ("demo_wide", "cramped_down"), protocol="published") for agent in ("AD", "mine")]
     (table,) = page.returns_tables(runs, "published")
     assert list(table.columns) == ["demo_wide", "cramped_down", page.AVERAGE]
@@ -159,7 +159,7 @@ def test_tables_have_our_and_the_papers_numbers():
     assert not any("paper" in note for of_row in seeded.rows.values() for found in of_row for note in found.notes)
 
 
-def test_published_numbers_of_groups_of_cells():
+def test_published_numbers_are_found_for_complete_groups_only():
     track = [ResultCell(layout, family) for layout in TRACKS["layout"]["test"] for family in HEURISTICS]
     assert page.published_score("AD", track) == (2.6, 4.1)
     assert (
@@ -171,7 +171,7 @@ def test_published_numbers_of_groups_of_cells():
     assert found == [(-7.6, None), *2 * [tuple(page.published_cells("AD")["test_wide"][page.AVERAGE])]]
 
 
-def test_incomplete_and_flat_groups_are_marked(measured):
+def test_incomplete_results_and_missing_headroom_are_marked(measured):
     found = page.table_score(DEMO_WIDE, evaluated_run("AD", families=("H1", "H2")), "seeded")
     assert (found.text, found.notes[:2]) == ("11.0 ± 0.0", ["2 of 4 cells", "score 0.55"])
     few = evaluated_run("AD", tasks=[task for task in TEST_TASKS if task.layout.name == "demo_wide"][:2])
@@ -180,11 +180,11 @@ def test_incomplete_and_flat_groups_are_marked(measured):
     flat_cell = ResultCell("coord_simple", "H1")
     flat = page.table_score([flat_cell], evaluated_run("AD", ("coord_simple",)), "seeded")
     assert flat.is_flat and flat.notes[-1] == "no headroom"
-    assert page.table_score([flat_cell], None, "published").is_flat, "by the oracle"
+    assert page.table_score([flat_cell], None, "published").is_flat, "measured by the oracle"
     assert not page.table_score([flat_cell._replace(kind="validation")], None, "seeded").is_flat, "nothing was measured"
 
 
-def test_csv_and_markdown_have_the_numbers_of_each_cell(measured):
+def test_csv_and_markdown_reports_have_all_numbers(measured):
     runs = [evaluated_run("AD", protocol="published", trained_on=None), evaluated_run("AD", note="K250")]
     found = pd.read_csv(StringIO(page.csv_text(runs)), keep_default_na=False)
     assert set(found["agent"]) == {"AD", "AD [K250]"} and set(found["block"]) == {*BLOCKS}

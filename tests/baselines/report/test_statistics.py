@@ -1,4 +1,4 @@
-"""Intervals and p-values against known numbers, and their coverage by simulation."""
+"""Confidence intervals and p-values compared with known numbers, and the coverage of intervals in simulations."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from icrl4aht_baselines.report.statistics import (
 from scipy.stats import ttest_1samp
 
 
-def test_normal_values_have_students_interval_and_p_value():
+def test_interval_and_p_value_of_normal_values_are_close_to_students():
     values = np.random.default_rng(3).normal(0.3, 1.0, 40)
     found = mean_interval(values)
     expected: Any = ttest_1samp(values, 0.0)
     low, high = expected.confidence_interval()
     np.testing.assert_allclose([found.low, found.high], [low, high], atol=0.06)
     assert found.mean == pytest.approx(values.mean()) and found.p == pytest.approx(expected.pvalue, abs=0.02)
-    assert mean_interval(values) == found, "random numbers are fixed"
+    assert mean_interval(values) == found, "the random numbers are fixed"
 
 
-def test_equal_values_few_values_and_empty_input():
+def test_intervals_of_equal_few_or_no_values_are_defined():
     found = mean_interval(np.full(5, 7.0), np.full((3, 2), 1.0))
     assert found[:3] == (4.0, 4.0, 4.0) and found.p == 0 and found.text() == "4.0 (4.0 to 4.0)"
     pair = mean_interval(np.array([[1.0, 2.0]]))
@@ -36,15 +36,15 @@ def test_equal_values_few_values_and_empty_input():
     assert np.isnan(mean_interval()).all() and MeanInterval(-0.01, -0.2, 0.3).text(sign="+") == "+0.0 (-0.2 to +0.3)"
 
 
-def test_seeds_do_not_count_as_instances_and_cells_are_not_resampled():
-    """Compare 15 values as instances, and as seeds of five instances; those of one instance are resampled."""
+def test_intervals_resample_instances_but_not_groups():
+    """Compare intervals of 15 values: one per instance, three seeds of five instances, and 15 seeds of one instance."""
     values = np.linspace(-1, 1, 15)
     flat, nested, single = (mean_interval(found) for found in (values, values.reshape(5, 3), values.reshape(1, 15)))
     assert nested.high - nested.low > 1.3 * (flat.high - flat.low) and single == flat
     assert mean_interval(np.full(3, 0.0), np.full(3, 10.0))[:3] == pytest.approx((5.0, 5.0, 5.0))
 
 
-def test_ratios_are_those_of_sums_and_trainings_widen_the_interval():
+def test_ratio_is_of_sums_and_several_trainings_widen_its_interval():
     gains, scales = np.array([[1.0, 3.0, 2.0, 4.0]]), np.array([2.0, 4.0, 2.0, 8.0])
     one = Stratum(gains, scales)
     assert ratio_interval([[one], [Stratum(gains[:, :2], scales[:2])]]).mean == pytest.approx((10 / 16 + 4 / 6) / 2)
@@ -54,13 +54,13 @@ def test_ratios_are_those_of_sums_and_trainings_widen_the_interval():
     assert found[1].high - found[1].low > found[0].high - found[0].low
 
 
-def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
+def test_interquartile_mean_drops_a_quarter_of_values_at_each_end():
     found = interquartile_mean(np.array([-100.0, 0, 1, 2, 3, 4, 5, 900]))
     assert found.mean == 2.5 and found.low < 2.5 < found.high
     assert np.isnan(interquartile_mean(np.ones(3)).low)
 
 
-def test_holms_correction():
+def test_holm_corrects_p_values():
     found = holm({"a": 0.01, "b": 0.04, "c": 0.03, "d": float("nan")})
     assert [found[name] for name in "abc"] == pytest.approx([0.03, 0.06, 0.06]) and np.isnan(found["d"])
     assert holm({}) == {}
@@ -69,7 +69,7 @@ def test_holms_correction():
 @pytest.mark.slow
 @pytest.mark.parametrize("trainings", [1, 5])
 def test_intervals_have_the_stated_coverage(trainings):
-    """Five units in each of four cells of unequal variance, and a common effect of each training."""
+    """Simulate four groups of five units with unequal variances, and an effect that all units of a training share."""
     rng, covered, rounds = np.random.default_rng(1), 0, 800
     for _ in range(rounds):
         common = rng.normal(0.0, 0.5, (trainings, 1)) if trainings > 1 else np.zeros((1, 1))

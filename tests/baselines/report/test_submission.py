@@ -1,4 +1,4 @@
-"""Files of results: made from folders of `evaluate`, and refused where they are incomplete or not comparable."""
+"""Submissions: files made from results of `evaluate`, refused if incomplete or not comparable."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FACTS = AgentFacts("a rule", "none", "none")
 
 @pytest.fixture(scope="module")
 def submitted(tmp_path_factory) -> Path:
-    """Return a file of two trainings of an agent, the second with a control."""
+    """Write a submission of two trainings of an agent; the second training has results with memory cleared."""
     folder = tmp_path_factory.mktemp("submitted")
     write_results(folder / "one", "rule", CURVE)
     write_results(folder / "two", "rule", CURVE, trained_on=[{"layout": "asymm_both", "family": "H1"}])
@@ -31,7 +31,7 @@ def submitted(tmp_path_factory) -> Path:
     return folder / "rule.json"
 
 
-def test_a_file_has_all_results_of_all_folders(submitted):
+def test_submission_has_all_results_of_all_folders(submitted):
     found = read_submission(submitted)
     assert (found.agent, found.tracks, found.facts.about) == ("rule", ["layout"], "a rule")
     parts = [(one.control, one.training, len(one.returns)) for one in found.evaluations]
@@ -77,13 +77,13 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: c["facts"].update(data=""), "Expected `str` of length >= 1 - at `\\$.facts.data`"),
     ],
 )  # fmt: skip
-def test_what_is_refused(submitted, tmp_path, change, message):
+def test_incomplete_or_invalid_submission_raises_error(submitted, tmp_path, change, message):
     with pytest.raises(OptionError, match=message) as caught:
         read_submission(changed(submitted, tmp_path / "bad.json", change))
     assert str(caught.value).startswith(str(tmp_path / "bad.json"))
 
 
-def test_folders_that_are_refused(tmp_path):
+def test_results_that_cannot_be_submitted_raise_errors(tmp_path):
     with pytest.raises(OptionError, match=f"{tmp_path}/none: no results in"):
         make_submission([tmp_path / "none"], FACTS)
     folder = write_results(tmp_path / "undeclared", "rule", CURVE, trained_on=None)
@@ -102,7 +102,7 @@ def test_folders_that_are_refused(tmp_path):
             make_submission([folder], FACTS)
 
 
-def test_the_commands(submitted, tmp_path, monkeypatch):
+def test_submit_and_results_commands_write_file_and_page(submitted, tmp_path, monkeypatch):
     monkeypatch.setattr(comparison, "results_file", lambda: tmp_path / "stored.json")
     folder = str(write_results(tmp_path / "mine", "mine", CURVE))
     said = ["--about", "a rule", "--data", "none", "--labels", "none", "--core-hours", "1.5", "--name", "my rule"]
@@ -126,8 +126,8 @@ def test_the_commands(submitted, tmp_path, monkeypatch):
             run_cli(*words)
 
 
-def test_another_way_of_playing_is_added(tmp_path):
-    """Its folder is told by its name; with --update it is added to stored results, alone."""
+def test_results_with_sampled_actions_are_added_to_an_agent(tmp_path):
+    """Results with sampled actions are recognized by the agent's name, and can be added to stored results later."""
     own, drawn = (
         write_results(tmp_path / name, name, CURVE, sampled=name != "mine") for name in ("mine", "mine (sampled)")
     )

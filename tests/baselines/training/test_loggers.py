@@ -1,4 +1,4 @@
-"""Loggers, with the real libraries in their offline modes: what a run writes, resumes and refuses."""
+"""Loggers of training runs, tested with the real logging libraries in their offline modes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def expected(lines: list[dict[str, Any]]) -> list[Value]:
 
 
 def tensorboard_values(run: Path) -> list[Value]:
-    """Return (step, part/name, value) of each record in a run's event files."""
+    """Return (step, part/name, value) of each record in a run's TensorBoard files."""
     from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
 
     found = []
@@ -51,7 +51,7 @@ def tensorboard_values(run: Path) -> list[Value]:
 
 
 def wandb_values(run: Path) -> list[Value]:
-    """Return (step, part/name, value) of each record, once wandb's own process has written them."""
+    """Return (step, part/name, value) of each record, waiting until wandb's process has written them."""
     for _ in range(100):
         if found := wandb_records(run):
             return found
@@ -60,7 +60,7 @@ def wandb_values(run: Path) -> list[Value]:
 
 
 def wandb_records(run: Path) -> list[Value]:
-    """Return (step, part/name, value) of each record in a run's offline file, a log of LevelDB of one block."""
+    """Return (step, part/name, value) of each record in wandb's offline file, a LevelDB log of one block."""
     from wandb.proto import wandb_internal_pb2
 
     (path,) = run.glob("wandb/offline-run-*/*.wandb")
@@ -68,7 +68,7 @@ def wandb_records(run: Path) -> list[Value]:
     assert len(content) < 32768
     while at < len(content):
         _, length, kind = struct.unpack_from("<IHB", content, at)
-        assert kind == 1, "a complete record"
+        assert kind == 1, "expected a complete record"
         record = wandb_internal_pb2.Record.FromString(content[at + 7 : at + 7 + length])  # type: ignore[attr-defined]
         items = {item.key or "/".join(item.nested_key): item.value_json for item in record.history.item}
         step = record.history.step.num
@@ -78,7 +78,7 @@ def wandb_records(run: Path) -> list[Value]:
 
 
 def trackio_values(run: Path) -> list[Value]:
-    """Return (step, part/name, value) of each record in a run's database."""
+    """Return (step, part/name, value) of each record in a run's trackio database."""
     with sqlite3.connect(f"file:{run}/trackio/icrl4aht-data.db?mode=ro", uri=True) as database:
         rows = database.execute("select step, metrics from metrics where run_name = ?", [run.name]).fetchall()
     database.close()
@@ -95,7 +95,7 @@ LIBRARIES = {"tensorboard": "tensorboardX", "wandb": "wandb", "trackio": "tracki
 
 @pytest.fixture
 def offline(monkeypatch):
-    """No variable of the user, a token at hand, and no connection but to this machine."""
+    """Remove the user's logging variables, set a token, and allow connections only to this machine."""
     for name in ("WANDB_MODE", "WANDB_PROJECT", "TRACKIO_DIR", "TRACKIO_SPACE_ID", "TRACKIO_SERVER_URL"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HF_TOKEN", "hf_of_a_test")
@@ -116,16 +116,16 @@ def offline(monkeypatch):
     assert not hosts
 
 
-def forget(library: str) -> None:
-    """Remove a library from the imported modules, as in a new process: trackio chooses its folder once."""
+def unload_library(library: str) -> None:
+    """Remove a library from the imported modules, since trackio chooses its folder when it is imported."""
     for name in [name for name in sys.modules if name.partition(".")[0] == library]:
         del sys.modules[name]
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_a_resumed_run_has_every_line_once(tmp_path, name, offline, capfd):
+def test_loggers_of_a_resumed_run_have_every_line_once(tmp_path, name, offline, capfd):
     pytest.importorskip(LIBRARIES[name])
-    forget("trackio")
+    unload_library("trackio")
     run = tmp_path / "ad-run"
     run.mkdir()
     metrics = run / "metrics.jsonl"
@@ -134,7 +134,7 @@ def test_a_resumed_run_has_every_line_once(tmp_path, name, offline, capfd):
         write_lines(loggers, LINES)
         raise KeyboardInterrupt
     assert READERS[name](run) == expected(LINES)
-    metrics.write_text("".join(json.dumps(line) + "\n" for line in LINES[:1]))  # the checkpoint was at step 2
+    metrics.write_text("".join(json.dumps(line) + "\n" for line in LINES[:1]))  # lines before the checkpoint of step 2
     more = [*LINES[1:], {"step": 6, "part": "train", "loss": 1.0}]
     with open_loggers([name, name], metrics, {"train": {"seed": 0}}) as loggers:
         write_lines(loggers, more)
@@ -144,9 +144,9 @@ def test_a_resumed_run_has_every_line_once(tmp_path, name, offline, capfd):
 
 
 def log_two_runs(folder: Path) -> None:
-    """Write a run with trackio, and another one in the same process."""
+    """Write two runs with trackio in this process."""
     pytest.importorskip("trackio")
-    forget("trackio")
+    unload_library("trackio")
     for run in ("one", "two"):
         (folder / run).mkdir()
         (folder / run / "metrics.jsonl").touch()
@@ -154,13 +154,13 @@ def log_two_runs(folder: Path) -> None:
             write_lines(loggers, LINES)
 
 
-def test_trackio_writes_into_one_folder_per_process(tmp_path, offline):
+def test_second_trackio_folder_in_a_process_raises_error(tmp_path, offline):
     with pytest.raises(OptionError, match=r"as long as this process runs, expected .*two.*: train in another process"):
         log_two_runs(tmp_path)
     assert trackio_values(tmp_path / "one") == expected(LINES)
 
 
-def test_the_user_chooses_the_folder_of_trackio(tmp_path, offline, monkeypatch):
+def test_variable_trackio_dir_sets_the_folder_of_all_runs(tmp_path, offline, monkeypatch):
     monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
     log_two_runs(tmp_path)
     with sqlite3.connect(tmp_path / "trackio" / "icrl4aht-data.db") as database:
@@ -168,7 +168,7 @@ def test_the_user_chooses_the_folder_of_trackio(tmp_path, offline, monkeypatch):
     database.close()
 
 
-def test_unknown_loggers():
+def test_unknown_logger_raises_error():
     check_loggers(["json"])
     with pytest.raises(UnknownNameError, match=r"unknown logger 'wandbb'.*wandb"):
         check_loggers(["wandbb"])

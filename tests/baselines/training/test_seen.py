@@ -1,4 +1,4 @@
-"""The record of the layouts and teammates in a model's training data."""
+"""The record of layouts and teammates in a model's training data."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from icrl4aht_data.errors import NotStoredError, OptionError
 
 @pytest.fixture
 def dataset(two_sources) -> Dataset:
-    """Return noise histories of demo_wide with two teammates."""
+    """Return the noise histories of demo_wide in split train, with two teammates."""
     return load_icrl4aht(two_sources[0], split="train", layout="demo_wide", source="noise")
 
 
-def test_held_out_teammates_are_not_among_those_in_training(dataset):
+def test_held_out_teammates_are_not_in_the_training_data(dataset):
     split = hold_out(dataset, 0.1)
     assert split.teammates is not None
     held = teammate_ids(dataset, split.teammates.ids.tolist())
@@ -30,7 +30,7 @@ def test_held_out_teammates_are_not_among_those_in_training(dataset):
     assert len(trained) == len({entry.task_id for entry in split.train.entries})
 
 
-def test_training_cells_name_their_teammates(dataset):
+def test_training_record_lists_all_teammates_of_each_family(dataset):
     found = {}
     for cell in training_cells(dataset):
         of_cell = dataset.filter(teammate_kind=cell["algorithm"])
@@ -40,9 +40,9 @@ def test_training_cells_name_their_teammates(dataset):
     assert read_trained_on(training_cells(dataset), "run.json") == SeenInTraining(("demo_wide",), found)
 
 
-def test_teammates_of_one_policy_have_one_id():
+def test_teammate_id_depends_only_on_the_policy():
     h1 = published_task("demo_wide", "H1/t0").teammate
-    exact = {name: round(value, 6) for name, value in h1["theta"].items()}  # manifests round to single precision
+    exact = {name: round(value, 6) for name, value in h1["theta"].items()}  # manifests store single precision
     assert exact != h1["theta"]
     assert teammate_id(h1 | {"theta": exact, "theta_id": 9, "base_seed": 3}) == teammate_id(h1)
     assert teammate_id(published_task("demo_wide", "H1/t1").teammate) != teammate_id(h1)
@@ -50,7 +50,7 @@ def test_teammates_of_one_policy_have_one_id():
     assert teammate_id(policy) == "ab" * 8
 
 
-def test_releases_without_tasks_do_not_know_their_teammates(dataset, monkeypatch):
+def test_teammate_ids_are_none_for_releases_without_tasks(dataset, monkeypatch):
     def recover(history_id):
         raise NotStoredError("no tasks")
 
@@ -58,7 +58,7 @@ def test_releases_without_tasks_do_not_know_their_teammates(dataset, monkeypatch
     assert teammate_ids(dataset, dataset.ids.tolist()) is None
 
 
-def test_teammates_of_the_same_kind_are_merged():
+def test_training_records_of_the_same_algorithm_are_merged():
     greedy = {"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["b"]}
     learned = {"layout": "demo_wide", "split": "train", "family": "rl", "algorithm": "fcp", "teammates": ["a", "c"]}
     found = read_trained_on([greedy, greedy | {"layout": "demo_simple", "teammates": ["a"]}, learned], "run.json")
@@ -86,6 +86,6 @@ def test_teammates_of_the_same_kind_are_merged():
         [{"layout": "demo_wide", "family": "H4", "teammates": [3]}],
     ],
 )
-def test_records_of_another_form_are_refused(entries):
+def test_invalid_training_record_raises_error(entries):
     with pytest.raises(OptionError, match=r"run\.json: trained_on: expected "):
         read_trained_on(entries, "run.json")

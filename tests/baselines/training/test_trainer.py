@@ -1,4 +1,4 @@
-"""The trainer: steps, exact resume, several devices and processes, held-out data, run folders."""
+"""The trainer: training steps, exact resume, several devices and processes, held-out data, run folders."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ MODEL = dataclasses.replace(TINY, layers=1)
 
 
 class Rows:
-    """Batches of flat observations; each is a function of its number."""
+    """A sampler of batches with flat observations; a batch depends only on its number."""
 
     def __init__(self, seed: int = 0, die_at: int | None = None) -> None:
         self.seed, self.die_at = seed, die_at
@@ -60,7 +60,7 @@ class Rows:
 
 @cache
 def compiled() -> Trainer:
-    """Return one compiled trainer for all tests, with the method that has the most state."""
+    """Return a trainer that all tests share, for the method with the largest training state."""
     return Trainer(get_method("amago_offline")(MODEL, FLAT), OPTIONS)
 
 
@@ -71,8 +71,8 @@ def trained(folder: Path, die_at: int | None = None, changes: Any = None, **opti
 
 
 @pytest.fixture(scope="module")
-def through(tmp_path_factory) -> tuple[Path, TrainState]:
-    """An uninterrupted run."""
+def full_run(tmp_path_factory) -> tuple[Path, TrainState]:
+    """Return the folder and the final state of a training without interruption."""
     folder = tmp_path_factory.mktemp("runs") / "through"
     return folder, trained(folder)
 
@@ -82,26 +82,26 @@ def assert_same(one: Any, two: Any) -> None:
 
 
 class TestResume:
-    def test_a_killed_run_resumes_bit_for_bit(self, through, tmp_path):
+    def test_killed_training_resumes_bit_for_bit(self, full_run, tmp_path):
         with pytest.raises(KeyboardInterrupt):
-            # After the checkpoint of step 3 and after a logged line.
+            # Training dies after the checkpoint of step 3 and the logged line of step 4.
             trained(tmp_path, die_at=5, log_to=["tensorboard"])
         assert Checkpoints(tmp_path / CHECKPOINTS).latest == 3
         with (tmp_path / "metrics.jsonl").open("a") as log:
             log.write('{"step": 5, "cut o')
         state = trained(tmp_path, log_to=["tensorboard"])
         assert {path.name for path in (tmp_path / "tensorboard").iterdir()} == {"train", "held out"}
-        assert_same(state, through[1])
-        assert (tmp_path / "metrics.jsonl").read_bytes() == (through[0] / "metrics.jsonl").read_bytes()
-        assert (tmp_path / "config.json").read_bytes() == (through[0] / "config.json").read_bytes()
+        assert_same(state, full_run[1])
+        assert (tmp_path / "metrics.jsonl").read_bytes() == (full_run[0] / "metrics.jsonl").read_bytes()
+        assert (tmp_path / "config.json").read_bytes() == (full_run[0] / "config.json").read_bytes()
 
-    def test_a_finished_run_is_not_changed(self, through):
-        log = (through[0] / "metrics.jsonl").read_bytes()
-        assert_same(trained(through[0]), through[1])
-        assert (through[0] / "metrics.jsonl").read_bytes() == log
+    def test_training_a_finished_run_again_changes_nothing(self, full_run):
+        log = (full_run[0] / "metrics.jsonl").read_bytes()
+        assert_same(trained(full_run[0]), full_run[1])
+        assert (full_run[0] / "metrics.jsonl").read_bytes() == log
 
-    def test_what_is_written(self, through):
-        folder, state = through
+    def test_training_writes_log_curves_and_settings(self, full_run):
+        folder, state = full_run
         lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
         assert [(line["step"], line["part"]) for line in lines] == [
             (2, "train"),
@@ -118,44 +118,44 @@ class TestResume:
         config = read_config(folder)
         assert (config["train"]["steps"], config["method"]) == (7, "amago_offline")
 
-    def test_a_logger_that_is_not_installed_starts_no_run(self, tmp_path, monkeypatch):
+    def test_missing_logging_library_raises_error_before_training(self, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "wandb", None)
         with pytest.raises(OptionError, match="needs wandb: pip install"):
             trained(tmp_path / "run", log_to=["json", "wandb"])
         assert not (tmp_path / "run").exists()
 
-    def test_other_settings_are_refused(self, through):
+    def test_training_with_other_settings_than_the_run_raises_error(self, full_run):
         with pytest.raises(OptionError, match=r"other settings \(train.seed: it has 0, expected 3\); give another"):
-            trained(through[0], changes={"seed": 3})
+            trained(full_run[0], changes={"seed": 3})
 
 
 def terminate_at_4(step: int, loss: float | None) -> None:
-    """Send two SIGTERMs at a step that is logged but has no checkpoint."""
+    """Send two SIGTERMs to this process after step 4, which is logged but has no checkpoint."""
     if step == 4:
         os.kill(os.getpid(), signal.SIGTERM)
-        assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL  # with it the next one would kill the tests
+        assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL  # the default handler would end the test process
         os.kill(os.getpid(), signal.SIGTERM)
 
 
 class TestStopping:
-    def test_checkpoints_are_saved_by_time(self, tmp_path, monkeypatch):
+    def test_checkpoints_are_saved_after_a_time_interval(self, tmp_path, monkeypatch):
         monkeypatch.setattr("icrl4aht_baselines.training.trainer.SAVE_MINUTES", 1e-9)
         with pytest.raises(KeyboardInterrupt):
             trained(tmp_path, die_at=5)
-        assert Checkpoints(tmp_path / CHECKPOINTS).steps == [4, 5]  # without, step 3 alone
+        assert Checkpoints(tmp_path / CHECKPOINTS).steps == [4, 5]  # without SAVE_MINUTES, only step 3 would be saved
 
-    def test_a_signal_saves_and_the_run_resumes_to_the_same_bits(self, through, tmp_path):
+    def test_sigterm_saves_checkpoint_and_training_resumes_bit_for_bit(self, full_run, tmp_path):
         with pytest.raises(TrainingStopped, match=r"stopped by SIGTERM after step 4 of 7.* resumes it") as stopped:
             trained(tmp_path, done=terminate_at_4)
         assert stopped.value.code == 143
         assert Checkpoints(tmp_path / CHECKPOINTS).latest == 4
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-        assert_same(trained(tmp_path), through[1])
+        assert_same(trained(tmp_path), full_run[1])
         for name in ("metrics.jsonl", "config.json"):
-            assert (tmp_path / name).read_bytes() == (through[0] / name).read_bytes()
+            assert (tmp_path / name).read_bytes() == (full_run[0] / name).read_bytes()
 
-    def test_a_second_sigint_does_not_wait(self):
-        found = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    def test_second_sigint_stops_at_once(self):
+        found = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell ignore SIGINT
         try:
             with pytest.raises(KeyboardInterrupt), stop_signals() as stop:
                 os.kill(os.getpid(), signal.SIGINT)
@@ -165,7 +165,7 @@ class TestStopping:
         finally:
             signal.signal(signal.SIGINT, found)
 
-    def test_signals_are_not_noted_in_another_thread(self):
+    def test_stop_signals_changes_no_handler_outside_the_main_thread(self):
         def other_thread() -> Any:
             with stop_signals():
                 return signal.getsignal(signal.SIGINT)
@@ -173,7 +173,7 @@ class TestStopping:
         with ThreadPoolExecutor(1) as pool:
             assert pool.submit(other_thread).result() is signal.getsignal(signal.SIGINT)
 
-    def test_processes_agree(self, monkeypatch):
+    def test_processes_agree_on_saving_and_stopping(self, monkeypatch):
         def agreed(*every_process: tuple[int, int]) -> tuple[bool, int]:
             monkeypatch.setattr(jax, "process_count", lambda: len(every_process))
             monkeypatch.setattr(multihost_utils, "process_allgather", lambda own: np.array(every_process))
@@ -186,16 +186,16 @@ class TestStopping:
 
 
 class TestFolder:
-    def test_a_refused_training_does_not_block_the_corrected_one(self, through, tmp_path):
-        """Other settings are refused only if the run has a checkpoint."""
+    def test_run_without_checkpoint_accepts_other_settings(self, full_run, tmp_path):
+        """A run folder accepts other settings as long as it has no checkpoint."""
         first, corrected = ({**format_versions(), "train": {"batch_size": size}} for size in (10**9, 4))
         open_run(tmp_path / "run", first)
         assert open_run(tmp_path / "run", corrected) == corrected == read_config(tmp_path / "run")
-        shutil.copytree(through[0] / CHECKPOINTS, tmp_path / "run" / CHECKPOINTS)
+        shutil.copytree(full_run[0] / CHECKPOINTS, tmp_path / "run" / CHECKPOINTS)
         with pytest.raises(OptionError, match=r"train.batch_size: it has 4, expected 1000000000"):
             open_run(tmp_path / "run", first)
 
-    def test_folders_with_other_files_are_refused(self, tmp_path):
+    def test_run_folder_with_other_files_raises_error(self, tmp_path):
         (tmp_path / "notes.txt").touch()
         with pytest.raises(OptionError, match=r"has other files \(notes.txt\), expected a run, or an empty or new"):
             trained(tmp_path)
@@ -206,8 +206,8 @@ class TestFolder:
 
 class TestStep:
     @pytest.mark.slow
-    def test_parts_of_a_batch_add_up(self):
-        """Parts with unequal padding give the gradient of the complete batch."""
+    def test_accumulated_gradient_equals_gradient_of_complete_batch(self):
+        """Accumulating over parts with unequal padding gives the gradient of the complete batch."""
         method = get_method("ad")(dataclasses.replace(MODEL, dropout=0.0), FLAT)
         one, parts = (Trainer(method, dataclasses.replace(OPTIONS, accumulate=n)) for n in (1, 2))
         batch = Rows().batch(0)
@@ -223,34 +223,34 @@ class TestStep:
         for name in expected:
             np.testing.assert_allclose(expected[name], found[name], rtol=1e-5, err_msg=name)
 
-    def test_the_learning_rate_is_the_papers(self):
+    def test_learning_rate_has_warmup_and_cosine_decay(self):
         schedule = training.learning_rate_schedule(TrainOptions(steps=100, warmup=0.05))
         rates = [np.asarray(schedule(t)) for t in (0, 3, 5, 50, 100)]
         cosine = 1e-3 * (1 + np.cos(np.pi * (50 - 5) / 95)) / 2
         np.testing.assert_allclose(rates, [0.0, 6e-4, 1e-3, cosine, 0.0], rtol=1e-5, atol=1e-9)
 
-    def test_batches_that_cannot_be_divided(self):
+    def test_indivisible_batch_size_raises_error(self):
         with pytest.raises(OptionError, match="batch_size = 4: expected a multiple of 3, 1 devices x 3 parts"):
             Trainer(get_method("ad")(MODEL, FLAT), dataclasses.replace(OPTIONS, accumulate=3))
 
 
 @pytest.fixture(scope="module")
 def long_ppo(tmp_path_factory) -> Path:
-    """A release whose PPO histories are longer than its noise histories."""
+    """Return a release with PPO histories of 7 episodes and noise histories of 6 episodes."""
     root = tmp_path_factory.mktemp("releases") / "both"
     two_source_release(root, ppo_episodes=7)
     return root
 
 
 def job(root: Path | None, method: str = "ad", layout: str = "demo_wide", context: int = 7, **choice: Any) -> Any:
-    """Return a training on histories of a release, the bundled one by default."""
+    """Return a training on histories of a release; None as its folder selects the bundled release."""
     options = dataclasses.replace(OPTIONS, context=context)
     return prepare(method, MODEL, options, HistoryOptions((layout,), root and str(root), **choice))
 
 
 class TestHeldOut:
-    def test_parts_share_no_history_and_no_teammate(self, tmp_path, monkeypatch):
-        """Without teammate descriptions, each task counts as its own teammate."""
+    def test_held_out_parts_share_no_history_and_no_teammate(self, tmp_path, monkeypatch):
+        """If teammates have no description, each task counts as a separate teammate."""
         random_release(tmp_path / "r", layouts=("demo_wide",), teammates=5, streams=4, episodes=2)
         dataset = load_icrl4aht(tmp_path / "r", obs="state")
         monkeypatch.setattr(dataset_module, "teammate_ids", lambda dataset, ids: None)
@@ -267,19 +267,19 @@ class TestHeldOut:
         again = hold_out(dataset.select(dataset.ids[::-1].copy()), 0.25)
         assert set(again.train.ids) == set(split.train.ids)
 
-    def test_histories_of_split_validation_are_the_part_with_other_teammates(self, two_sources):
+    def test_split_validation_is_the_part_with_held_out_teammates(self, two_sources):
         about = job(two_sources[0]).about
         assert about["histories"]["sizes"] == {"train": 13, "histories": 1, "teammates": 6}
         assert about["histories"]["teammates_split"] == "validation"
         assert {cell["split"] for cell in about["trained_on"]} == {"train"}
         assert {cell["source"] for cell in about["trained_on"]} == {"ppo", "noise"}
-        learned = job(two_sources[0], source=("ppo",)).about  # no validation histories are of this source
+        learned = job(two_sources[0], source=("ppo",)).about  # the release has no PPO histories in split validation
         assert learned["histories"]["sizes"] == {"train": 3, "histories": 1, "teammates": 4}
         assert learned["histories"]["teammates_split"] == "train"
 
-    def test_tasks_with_one_history_are_trained_on(self, two_sources):
+    def test_tasks_with_one_history_are_not_held_out(self, two_sources):
         dataset = load_icrl4aht(two_sources[0], source="ppo", layout="demo_wide")
-        split = hold_out(dataset[3:8], validation=dataset[:1])  # one history of the first task, four of the second
+        split = hold_out(dataset[3:8], validation=dataset[:1])  # the first task has one history, the second four
         assert split.train.ids.tolist()[0] == dataset.ids[3]
         assert split.histories is not None
         assert (len(split.train), len(split.histories)) == (4, 1)
@@ -287,7 +287,7 @@ class TestHeldOut:
         with pytest.raises(OptionError, match=r"every task of .* has one history: expected a task with two"):
             hold_out(dataset[3:4])
 
-    def test_labels(self, two_sources):
+    def test_labels_default_to_expert_only_for_dpt(self, two_sources):
         for method, given, labels in (
             ("dpt", "oracle", "oracle"),
             ("dpt", None, "expert"),
@@ -301,7 +301,7 @@ class TestHeldOut:
             assert {cell["labels"] for cell in found.about["trained_on"]} == {labels}
             assert {sampler.labels for sampler in (found.data.train, *found.data.validation.values())} == {labels}
 
-    def test_samplers_draw_as_chosen(self, two_sources):
+    def test_samplers_use_options_every_and_queries(self, two_sources):
         found = job(two_sources[0], context=40, every=3)
         assert {sampler.every for sampler in (found.data.train, *found.data.validation.values())} == {3}
         assert job(two_sources[0], "dpt", context=40, queries=3).data.train[0].query_target.shape == (
@@ -309,7 +309,7 @@ class TestHeldOut:
             3,
         )
 
-    def test_one_teammate_cannot_be_held_out(self):
+    def test_only_teammate_of_the_data_is_not_held_out(self):
         dataset = load_icrl4aht(layout="asymm_both_plain")
         dataset = dataset.filter(task_id=dataset.entries[0].task_id)[:5]
         split = hold_out(dataset)
@@ -317,8 +317,8 @@ class TestHeldOut:
         assert split.histories is not None
         assert [len(split.train), len(split.histories)] == [len(dataset) - 1, 1]
 
-    def test_filters_choose_the_histories_and_are_recorded(self):
-        """Filter the teammates of demo_simple, which have several families and algorithms."""
+    def test_filters_select_histories_and_are_recorded(self):
+        """Filter histories of demo_simple by the teammate's family and algorithm and by source."""
         everything = job(None, layout="demo_simple").about["trained_on"]
         learned = job(None, layout="demo_simple", teammate_family=("rl",)).about
         assert {cell["family"] for cell in everything} == {"rl", "H1", "H2", "H3", "H4"}
@@ -328,7 +328,7 @@ class TestHeldOut:
         (cell,) = job(None, layout="demo_simple", algorithm=(one,), source=("ppo",)).about["trained_on"]
         names = {"layout": "demo_simple", "split": "train", "family": "rl", "algorithm": one, "source": "ppo"}
         assert cell.items() >= names.items()
-        assert cell["histories"] < len(load_icrl4aht(layout="demo_simple", teammate_kind=one))  # some are held out
+        assert cell["histories"] < len(load_icrl4aht(layout="demo_simple", teammate_kind=one))  # the rest is held out
 
     @pytest.mark.parametrize(
         ("filters", "message"),
@@ -344,7 +344,7 @@ class TestHeldOut:
             ),
         ],
     )
-    def test_filters_that_no_history_passes(self, filters, message):
+    def test_filters_that_match_no_history_raise_error(self, filters, message):
         with pytest.raises(EmptySelectionError, match=message):
             job(None, layout="asymm_both", **filters)
 
@@ -358,11 +358,11 @@ class TestHeldOut:
             ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
         ],
     )
-    def test_invalid_training_options(self, long_ppo, method, context, choice, message):
+    def test_training_options_that_do_not_fit_the_data_raise_errors(self, long_ppo, method, context, choice, message):
         with pytest.raises(OptionError, match=message):
             job(long_ppo, method, context=context, **choice)
 
-    def test_releases_without_labels(self, tmp_path):
+    def test_dpt_training_without_labels_raises_error(self, tmp_path):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
         with pytest.raises(LabelsMissingError, match=r"have no expert actions.*: use labels that all have"):
             job(tmp_path / "r", "dpt")
@@ -374,7 +374,7 @@ import jax
 import jax.experimental.multihost_utils
 if len(sys.argv) > 2:
     jax.distributed.initialize(sys.argv[2], num_processes=2, process_id=int(os.environ["PROCESS"]))
-    # The processes connect now: later, one may still compile when the other has waited for 30 seconds, and fail.
+    # Connect before compiling: a process that compiles for over 30 seconds makes the other fail to connect.
     jax.experimental.multihost_utils.sync_global_devices("start")
 from pathlib import Path
 from icrl4aht_baselines.training.histories import prepare
@@ -396,8 +396,8 @@ def metrics(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
-def test_processes_share_the_batches(lite, monkeypatch):
-    """Concatenated rows of two processes equal those of one process."""
+def test_processes_split_the_rows_of_a_batch(lite, monkeypatch):
+    """The rows of two processes together equal the batch of one process."""
 
     def rows(index: int, count: int) -> Any:
         monkeypatch.setattr(jax, "process_index", lambda: index)
@@ -412,13 +412,13 @@ def test_processes_share_the_batches(lite, monkeypatch):
 @pytest.fixture(scope="module")
 def on_one_device(lite, tmp_path_factory) -> list[dict[str, Any]]:
     folder = tmp_path_factory.mktemp("one")
-    return across(lite[0], folder, [{}])
+    return train_across(lite[0], folder, [{}])
 
 
-def across(
+def train_across(
     root: Path, folder: Path, environments: list[dict[str, str]], *arguments: str, code: int = 0
 ) -> list[dict[str, Any]]:
-    """Train in one process per environment, check the exit code `code`, and return the log."""
+    """Train in one process for each dict of environment variables, check exit codes, and return the log."""
     processes = [
         start("-c", DEVICES, f"{root},{folder / 'run'}", *arguments, **environment) for environment in environments
     ]
@@ -438,22 +438,22 @@ def assert_close(one: list[dict[str, Any]], two: list[dict[str, Any]]) -> None:
 
 
 @pytest.mark.slow
-def test_two_devices_train_as_one(lite, tmp_path, on_one_device):
-    """Equal results on two devices, also with dropout, accumulation and validation."""
-    two = across(lite[0], tmp_path, [{"XLA_FLAGS": add_xla_flag("--xla_force_host_platform_device_count=2")}])
+def test_two_devices_give_the_log_of_one_device(lite, tmp_path, on_one_device):
+    """Two devices give the same log as one device, with dropout, gradient accumulation and validation."""
+    two = train_across(lite[0], tmp_path, [{"XLA_FLAGS": add_xla_flag("--xla_force_host_platform_device_count=2")}])
     assert_close(two, on_one_device)
 
 
 @pytest.mark.slow
-def test_two_processes_train_as_one(lite, tmp_path, on_one_device):
-    """If only process 1 receives SIGTERM, both processes save the step they are at, and the same command resumes."""
-    with socket.socket() as held:  # keeps the port from other programs; JAX's coordinator may share it
+def test_two_processes_stop_together_and_give_the_log_of_one_device(lite, tmp_path, on_one_device):
+    """After a SIGTERM to process 1, both processes save a checkpoint; the same command resumes the training."""
+    with socket.socket() as held:  # reserves the port for JAX's coordinator, which can share it
         held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         held.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{held.getsockname()[1]}"
         both = [{"PROCESS": "0"}, {"PROCESS": "1"}]
-        stopped = across(lite[0], tmp_path, [both[0], both[1] | {"STOP": "15"}], address, code=143)
+        stopped = train_across(lite[0], tmp_path, [both[0], both[1] | {"STOP": "15"}], address, code=143)
         assert [line["step"] for line in stopped] == [1]
         assert Checkpoints(tmp_path / "run" / CHECKPOINTS).steps == [1]
-        two = across(lite[0], tmp_path, both, address)
+        two = train_across(lite[0], tmp_path, both, address)
     assert_close(two, on_one_device)

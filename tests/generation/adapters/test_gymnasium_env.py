@@ -1,4 +1,4 @@
-"""Tasks as Gymnasium environments: the library's own checker, registered ids, and replays of recorded histories."""
+"""Tasks as Gymnasium environments: Gymnasium's checker, registered ids, and replays of recorded histories."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def env():
     return gymnasium.make(NAME)
 
 
-# Gymnasium's advice for images, which observations of 5x5 cells are not.
+# Gymnasium takes observations of 5x5 cells for images and advises to resize them.
 @pytest.mark.filterwarnings("ignore:.*resize")
-def test_check_env():
+def test_environment_passes_the_checker_of_gymnasium():
     check_env(gymnasium.make(NAME, channels="canonical", render_mode="rgb_array").unwrapped)
 
 
-def test_every_published_test_task_has_an_id():
+def test_every_published_test_task_has_an_environment_id():
     ids = {name for name in gymnasium.registry if name.startswith("icrl4aht/")} - {TASK_ENVIRONMENT}
     tasks = {task.task_id for track in ("teammate", "layout") for task in published_tasks(track)}
     arguments = [gymnasium.spec(name).kwargs for name in ids]
@@ -41,13 +41,13 @@ def test_every_published_test_task_has_an_id():
     assert len(ids) == len(tasks) == 160
 
 
-def test_the_prefix_of_an_id_imports_the_package():
-    """Importing the package registers the ids, on which the other tests rely."""
+def test_module_prefix_of_an_environment_id_imports_the_package():
+    """The other tests rely on ids that importing the package registers."""
     code = f"import gymnasium; print(gymnasium.make('icrl4aht_data:{NAME}').spec.id)"
     assert run_python("-c", code).strip() == NAME
 
 
-def test_episodes_are_functions_of_the_seed(env):
+def test_episodes_depend_only_on_seed_and_actions(env):
     def play(seed: int) -> list[np.ndarray]:
         _, info = env.reset(seed=seed)
         seen = [info["state"]]
@@ -59,17 +59,17 @@ def test_episodes_are_functions_of_the_seed(env):
     first = play(1)
     np.testing.assert_array_equal(first, play(1))
     assert not np.array_equal(first, play(2))
-    # The next episode without a seed is another one.
+    # A reset without a seed starts another episode.
     assert not np.array_equal(first[0], env.reset()[1]["state"])
 
 
-def bundled(**filters) -> tuple:
+def first_history(**filters) -> tuple:
     dataset = load_icrl4aht(obs="uint8", **filters)
     return dataset, dataset[0]
 
 
 def replay(env, history, episode: int, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Compare a recorded episode with one in which the ego acts as recorded; return its observations and last state."""
+    """Replay a recorded episode with the ego's recorded actions; return the observations and the last state."""
     own = slice(100 * episode, 100 * episode + 100)
     observation, info = env.reset(options=options)
     observations, rewards, terminated, truncated, infos = zip(*map(env.step, history.actions[own]), strict=True)
@@ -89,8 +89,8 @@ def replay(env, history, episode: int, options: dict[str, Any]) -> tuple[np.ndar
     ],
     ids=str,
 )
-def test_recorded_actions_lead_to_the_recorded_history(filters):
-    dataset, history = bundled(**filters)
+def test_recorded_actions_reproduce_the_recorded_history(filters):
+    dataset, history = first_history(**filters)
     recovered = dataset.recover_environment(history.entry.history_id)
     assert recovered.spec.max_episode_steps == 400
     returns = history.returns()
@@ -103,16 +103,16 @@ def test_recorded_actions_lead_to_the_recorded_history(filters):
 
 
 @pytest.mark.parametrize("source", ["ppo", pytest.param("noise", marks=pytest.mark.slow)])
-def test_recovered_keys_reproduce_heuristics(source):
-    """With the keys of a recorded episode, the teammate's policy plays as recorded without a script."""
-    dataset, history = bundled(layout="demo_wide", source=source, teammate_family=["H1", "H2", "H3", "H4"])
+def test_recovered_keys_reproduce_actions_of_heuristic_teammates(source):
+    """With the random keys of a recorded episode, the teammate's policy takes the recorded actions."""
+    dataset, history = first_history(layout="demo_wide", source=source, teammate_family=["H1", "H2", "H3", "H4"])
     recovered = dataset.recover_environment(history.entry.history_id)
     for episode in (0, int(history.returns().argmax())):
         replay(recovered, history, episode, recorded_draws(dataset, history.entry.history_id, episode))
 
 
-def test_the_policy_acts_after_the_recorded_steps():
-    dataset, history = bundled(layout="demo_wide", source="noise")
+def test_teammate_policy_acts_after_the_given_actions_end():
+    dataset, history = first_history(layout="demo_wide", source="noise")
     recovered = dataset.recover_environment(history.entry.history_id)
     number = history.entry.history_id
     scripted = {name: array[:50] for name, array in dataset.reset_options(number).items() if name != "state"}
@@ -122,14 +122,14 @@ def test_the_policy_acts_after_the_recorded_steps():
     assert set(teammate[50:]) - {4}
 
 
-def test_episodes_of_other_code_have_no_known_keys(lite):
+def test_recovering_keys_of_unknown_recording_code_raises_error(lite):
     dataset = load_icrl4aht(lite[0])
     with pytest.raises(NotStoredError, match=r"take dataset\.reset_options"):
         recorded_draws(dataset, 0)
 
 
-def test_recovered_environments_take_options():
-    dataset, history = bundled(layout="demo_wide", source="noise", channels="canonical")
+def test_recovered_environments_accept_length_and_render_mode():
+    dataset, history = first_history(layout="demo_wide", source="noise", channels="canonical")
     recovered = dataset.recover_environment(history.entry.history_id, max_episode_steps=3, render_mode="rgb_array")
     assert recovered.observation_space.shape == (5, 5, 46)
     np.testing.assert_array_equal(recovered.reset(options={"state": history.state[0]})[0], history.obs[0])
@@ -137,13 +137,13 @@ def test_recovered_environments_take_options():
     assert recovered.render().ndim == 3
 
 
-def test_a_release_without_tasks_has_no_environments(converted_release):
+def test_recovering_environment_of_release_without_tasks_raises_error(converted_release):
     with pytest.raises(NotStoredError, match=r"convert again with tasks\.jsonl"):
         load_icrl4aht(converted_release).recover_environment(0)
 
 
-def test_episodes_that_do_not_exist_are_errors():
-    dataset, history = bundled(layout="demo_wide", source="noise")
+def test_episode_number_out_of_range_raises_error():
+    dataset, history = first_history(layout="demo_wide", source="noise")
     with pytest.raises(OptionError, match=r"episode = 40: history \d+ has episodes 0\.\.39"):
         dataset.reset_options(history.entry.history_id, 40)
     with pytest.raises(OptionError, match="episode = -1"):
@@ -161,14 +161,14 @@ def test_episodes_that_do_not_exist_are_errors():
     ],
     ids=str,
 )
-def test_wrong_options_are_errors(env, options, error, message):
+def test_invalid_reset_options_raise_errors(env, options, error, message):
     if isinstance(options.get("state"), str):
         options = {"state": np.zeros(record_size(env.unwrapped.layout), np.uint8)}
     with pytest.raises(error, match=message):
         env.reset(options=options)
 
 
-def test_wrong_use_is_an_error():
+def test_wrong_use_of_task_environment_raises_errors():
     fresh = published_environment("demo_wide", "H4/t0")
     with pytest.raises(OptionError, match="call reset"):
         fresh.step(0)

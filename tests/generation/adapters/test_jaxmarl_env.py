@@ -1,4 +1,4 @@
-"""The environment with JaxMARL's interface: its base class, its wrapper of logs, and equal play of our environment."""
+"""The environment with JaxMARL's interface: base class, log wrapper, and equality with our environment."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from icrl4aht_data.overcooked.observe import observe_both
 N, STEPS, LENGTH = 4, 30, 12
 
 
-def test_it_implements_the_base_class():
-    """Every abstract method of JaxMARL's base class is implemented, and its results fit the spaces."""
+def test_environment_implements_the_base_class_of_jaxmarl():
+    """Every abstract method of JaxMARL's base class is implemented, and returns values within the declared spaces."""
     env = JaxMARLEnv("demo_wide", channels="canonical")
     assert isinstance(env, MultiAgentEnv)
     obs, state = env.reset(jax.random.PRNGKey(0))
@@ -36,8 +36,8 @@ def test_it_implements_the_base_class():
 
 
 @pytest.mark.slow
-def test_a_vmapped_training_loop_equals_our_environment():
-    """The loop of JaxMARL's IPPO: its wrapper, vmapped over environments and scanned over steps, with resets."""
+def test_jaxmarl_training_loop_gives_steps_of_our_environment():
+    """Step as JaxMARL's IPPO does: with the log wrapper, vmapped over environments, scanned over steps."""
     env, layout = JaxMARLEnv("cramped_up", max_steps=LENGTH), get_layout("cramped_up")
     logged = LogWrapper(env, replace_info=False)
     keys = jax.random.split(jax.random.PRNGKey(3), N)

@@ -1,4 +1,4 @@
-"""Both agents as a PettingZoo environment: the library's own test, and recorded histories played again."""
+"""The PettingZoo environment of both agents: PettingZoo's checks, and replays of recorded histories."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from icrl4aht_data.overcooked.observe import observe_both
 
 
 @pytest.mark.parametrize("channels", ["own", "canonical"])
-def test_parallel_api(channels):
+def test_environment_passes_the_parallel_api_test_of_pettingzoo(channels):
     parallel_api_test(BothAgentsEnv("coord_simple", max_steps=30, channels=channels), num_cycles=100)
 
 
-def test_seeds_decide_episodes():
+def test_environment_passes_the_seed_test_of_pettingzoo():
     parallel_seed_test(lambda: BothAgentsEnv("coord_ring"))
 
 
-def test_recorded_actions_lead_to_recorded_states_and_rewards():
+def test_recorded_actions_of_both_agents_reproduce_states_and_rewards():
     history = load_icrl4aht(layout="cramped_up", source="noise")[0]
     env = BothAgentsEnv("cramped_up")
     first = 100 * int(history.returns().argmax())
@@ -31,7 +31,7 @@ def test_recorded_actions_lead_to_recorded_states_and_rewards():
     pairs = zip(history.actions[first : first + 100], history.teammate_actions[first : first + 100], strict=True)
     delivered = np.flatnonzero(history.rewards[first : first + 100] > 0)
     assert len(delivered)
-    # A delivery is followed by a newly drawn recipe, so states are compared up to the first one.
+    # States are compared up to the first delivery, after which a new recipe is drawn.
     for t, (ego, teammate) in enumerate(pairs):
         if t > delivered[0]:
             break
@@ -43,14 +43,14 @@ def test_recorded_actions_lead_to_recorded_states_and_rewards():
         assert infos.keys() == {"ego", "teammate"} and not any(truncations.values())
 
 
-def test_pictures():
+def test_render_returns_an_rgb_image():
     env = BothAgentsEnv("demo_wide", render_mode="rgb_array")
     env.reset(seed=0)
     picture = env.render()
     assert picture is not None and picture.shape[2] == 3
 
 
-def test_wrong_use_is_an_error():
+def test_wrong_use_of_two_agent_environment_raises_errors():
     env = BothAgentsEnv("demo_wide", max_steps=1)
     assert repr(env) == "BothAgentsEnv(demo_wide, episodes of 1 step)"
     with pytest.raises(OptionError, match="call reset"):

@@ -1,4 +1,4 @@
-"""Collection of one task: killed and resumed runs write the artefact of an uninterrupted run; full disks."""
+"""Collection of one task: killed and resumed runs write the same artefact; full disks give clear errors."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ def stop_after(updates: int):
 
 
 def never(updates, speed):
-    raise AssertionError("the task was started")
+    raise AssertionError("expected no further update of the task")
 
 
 @pytest.mark.slow
-def test_runs_killed_at_random_write_the_same_artefact(built, tmp_path):
+def test_collection_killed_at_random_times_writes_the_same_artefact(built, tmp_path):
     folder = tmp_path / artefact(built / "a").name
     command = ["-c", COLLECT, str(built / "tiny.toml"), str(tmp_path), "0.1"]
     seed = int(os.environ.get("KILL_SEED", "7"))
@@ -90,7 +90,7 @@ def test_runs_killed_at_random_write_the_same_artefact(built, tmp_path):
     assert not partial_folder(folder).exists()
 
 
-def test_updates_after_the_last_save_are_repeated(built, job):
+def test_resumed_collection_repeats_updates_after_the_last_save(built, job):
     with pytest.raises(KeyboardInterrupt):
         job.run(stop_after(7), save_seconds=0)
     partial = partial_folder(job.folder)
@@ -98,13 +98,13 @@ def test_updates_after_the_last_save_are_repeated(built, job):
     with (partial / METRICS).open("a") as stream:
         stream.write('{"update": 6, "half a li')
     rewards = np.load(partial / "rewards.npy", mmap_mode="r+")
-    rewards[:, 180:] = 77  # six updates of 80 steps led to the first 180 that are kept
+    rewards[:, 180:] = 77  # the six saved updates have recorded 180 steps, and later values are not valid
     rewards.flush()
     job.run()
     assert not compare_rebuilds(job.folder, artefact(built / "a")).differences
 
 
-def test_killed_after_the_last_update(built, job, monkeypatch):
+def test_collection_killed_after_the_last_update_resumes(built, job, monkeypatch):
     def kill(*arguments):
         raise KeyboardInterrupt
 
@@ -116,14 +116,14 @@ def test_killed_after_the_last_update(built, job, monkeypatch):
     assert not compare_rebuilds(job.folder, artefact(built / "a")).differences
 
 
-def test_killed_before_renaming(built, job):
+def test_collection_killed_before_renaming_its_folder_resumes(built, job):
     shutil.copytree(artefact(built / "a"), partial_folder(job.folder))
     (partial_folder(job.folder) / LEARNER).write_bytes(b"no longer needed")
     job.run(never)
     assert not compare_rebuilds(job.folder, artefact(built / "a")).differences
 
 
-def test_a_partial_of_other_settings_is_started_again(job, tmp_path, monkeypatch):
+def test_partial_collection_with_other_settings_starts_again(job, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         job.run(stop_after(4), save_seconds=0)
     (tmp_path / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 80\nclip = 0.1"))
@@ -140,17 +140,17 @@ def test_a_partial_of_other_settings_is_started_again(job, tmp_path, monkeypatch
     assert firsts == [3, 0]
 
 
-def test_a_finished_task_is_unchanged(built, job):
+def test_collecting_a_finished_task_again_changes_nothing(built, job):
     shutil.copytree(artefact(built / "a"), job.folder)
     before = (job.folder / METADATA).stat().st_mtime_ns
     job.run(never)
     assert (job.folder / METADATA).stat().st_mtime_ns == before
 
 
-# A full disk: a clear error, no SIGBUS, no leftover files.
+# Full disks give a clear error, no SIGBUS, and leave no files behind.
 
 
-def test_free_space_is_checked_before_the_work(job, tmp_path, monkeypatch):
+def test_too_little_free_space_raises_error_before_collection(job, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=5_000))
     message = rf"^{job.folder}: the disk is full: this task needs [\d,]{{6,}} bytes, 5,000 are free; .* another --out$"
     with pytest.raises(DiskFullError, match=message):
@@ -158,7 +158,7 @@ def test_free_space_is_checked_before_the_work(job, tmp_path, monkeypatch):
     assert not [path for path in tmp_path.iterdir() if not path.name.endswith(".lock")]
 
 
-def test_arrays_are_allocated_not_sparse(job, tmp_path):
+def test_disk_space_of_arrays_is_allocated_in_advance(job, tmp_path):
     task, ego = job.work.task, job.profile.ego
     ArtefactWriter(tmp_path, task, ego, 0).close()
     for name, (shape, dtype) in array_shapes(task.layout, ego.environments, ego.episodes).items():
@@ -170,13 +170,13 @@ def test_arrays_are_allocated_not_sparse(job, tmp_path):
         assert path.read_bytes() == (tmp_path / "saved.npy").read_bytes()
 
 
-def test_a_failed_allocation_leaves_no_files(job):
+def test_failed_allocation_of_arrays_leaves_no_files(job):
     with file_size_limit(64 * 1024), pytest.raises(DiskFullError, match=r": the disk is full: this task needs "):
         job.run(never)
     assert not partial_folder(job.folder).exists()
 
 
-def test_a_full_disk_keeps_the_saved_state(job):
+def test_full_disk_during_collection_keeps_the_saved_state(job):
     def fill(updates, speed):
         if updates == 7:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

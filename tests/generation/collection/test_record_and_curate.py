@@ -1,4 +1,4 @@
-"""Recording of roll-outs, selection of the streams of a release, and their labels."""
+"""Recording of roll-outs, selection of the streams of a release, and labels of recorded steps."""
 
 from __future__ import annotations
 
@@ -23,10 +23,7 @@ from tests.helpers.states import random_records
 
 LAYOUT = LAYOUTS["cramped_up"]
 ENVS = 3
-UNTOUCHED = 99  # no action, no reward and no record byte below
-
-
-# Recording
+UNTOUCHED = 99  # a value that recorded arrays of these tests never contain
 
 
 def make_config(length: int, updates: int) -> PPOConfig:
@@ -42,7 +39,7 @@ def random_rollouts(length: int, updates: int) -> list[Rollout]:
     rng = np.random.default_rng(length)
     shape = (length, ENVS)
 
-    def one() -> Rollout:
+    def one_rollout() -> Rollout:
         fields: dict[str, Any] = {
             "record": rng.integers(0, UNTOUCHED, (*shape, record_size(LAYOUT)), np.uint8),
             "actions": rng.integers(0, 6, (*shape, 2), np.int32),
@@ -51,11 +48,11 @@ def random_rollouts(length: int, updates: int) -> list[Rollout]:
         rest: dict[str, Any] = {name: rng.normal(size=shape) for name in Rollout._fields if name not in fields}
         return Rollout(**fields, **rest)
 
-    return [one() for _ in range(updates)]
+    return [one_rollout() for _ in range(updates)]
 
 
-def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
-    """Keep one step of one environment at a time: the first 100 of each 400, and the state after them."""
+def record_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
+    """Record step by step: the first 100 of each 400 steps, and the state after the 100 steps."""
     kept = empty_histories(config)
     for update, rollout in enumerate(rollouts):
         for t in range(config.rollout):
@@ -77,20 +74,20 @@ def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
 @pytest.mark.parametrize(
     ("length", "updates"), [(256, 5), (256, 4), (96, 13), (7, 120), (900, 2), (400, 2), (100, 9), (100, 10)]
 )
-def test_recording_equals_a_loop_over_steps(length, updates):
+def test_recorded_arrays_equal_those_of_a_loop_over_steps(length, updates):
     config = make_config(length, updates)
     rollouts = random_rollouts(length, updates)
-    expected = kept_by_loop(rollouts, config)
+    expected = record_by_loop(rollouts, config)
     found = empty_histories(config)
     for number, rollout in enumerate(rollouts):
         record_rollout(found, number, rollout)
     for name, array in expected._asdict().items():
-        assert array.size and not (array == UNTOUCHED).any(), name  # every entry is filled
+        assert array.size and not (array == UNTOUCHED).any(), name  # every entry was written
         np.testing.assert_array_equal(getattr(found, name), array, err_msg=name)
         assert getattr(found, name).dtype == array.dtype
 
 
-def test_recording_is_idempotent_and_independent_of_order():
+def test_roll_outs_can_be_recorded_twice_and_in_any_order():
     config = make_config(96, 9)
     rollouts = random_rollouts(96, 9)
     once, again = empty_histories(config), empty_histories(config)
@@ -102,18 +99,15 @@ def test_recording_is_idempotent_and_independent_of_order():
         np.testing.assert_array_equal(getattr(again, name), array, err_msg=name)
 
 
-# Selection of streams
-
-
 def rewards_of(returns: list[list[int]]) -> np.ndarray:
-    """int8 (N, T): rewards of 5 or -5 that add up to these episode returns."""
+    """Return rewards int8 (N, T) of 5 or -5 that add up to the given episode returns."""
     totals = np.array(returns)[..., None] // 5
     rewards = np.where(np.arange(100) < abs(totals), 5 * np.sign(totals), 0).astype(np.int8)
     assert rewards.sum(axis=-1).tolist() == returns
     return rewards.reshape(len(returns), -1)
 
 
-def best(returns: list[list[int]], keep: int, least_improvement: float | None = None) -> list[int]:
+def best_of(returns: list[list[int]], keep: int, least_improvement: float | None = None) -> list[int]:
     return curate.best_streams(curate.stream_returns(rewards_of(returns)), keep, least_improvement).tolist()
 
 
@@ -124,26 +118,26 @@ def score_by_hand(curve: list[int]) -> float:
 
 
 @pytest.mark.parametrize("episodes", [5, 12, 40, 59, 60, 146])
-def test_best_streams_follow_the_formula(episodes):
+def test_best_streams_have_the_highest_end_plus_improvement(episodes):
     rng = np.random.default_rng(episodes)
-    returns = (rng.integers(-20, 80, (30, episodes)) * 5).tolist()  # also above an int8
+    returns = (rng.integers(-20, 80, (30, episodes)) * 5).tolist()  # some exceed int8
     scores = [score_by_hand(curve) for curve in returns]
     assert len(set(scores)) > 20
     expected = sorted(range(30), key=lambda n: -scores[n])
-    assert best(returns, 30) == expected
-    assert best(returns, 7) == expected[:7]
+    assert best_of(returns, 30) == expected
+    assert best_of(returns, 7) == expected[:7]
 
 
-def test_equal_streams_come_in_the_order_of_their_numbers():
-    low, high, also_high = [0] * 10, [0] * 5 + [20] * 5, [10] * 5 + [25] * 5  # 0, 40, 40
+def test_streams_with_equal_scores_are_ordered_by_number():
+    low, high, also_high = [0] * 10, [0] * 5 + [20] * 5, [10] * 5 + [25] * 5  # scores 0, 40 and 40
     curves = [low, high, low, also_high, high, low]
-    assert best(curves, 6) == [1, 3, 4, 0, 2, 5]
-    assert best(curves, 2) == [1, 3]
-    assert best([low] * 100 + [high] * 100, 200) == [*range(100, 200), *range(100)]
+    assert best_of(curves, 6) == [1, 3, 4, 0, 2, 5]
+    assert best_of(curves, 2) == [1, 3]
+    assert best_of([low] * 100 + [high] * 100, 200) == [*range(100, 200), *range(100)]
 
 
 def learner(*improvements: int) -> np.ndarray:
-    """Return the returns (N, 10) of streams that start at 0 and improve by this."""
+    """Return the episode returns (N, 10) of streams that start at 0 and improve by the given amounts."""
     return np.array([[0.0] * 5 + [float(improvement)] * 5 for improvement in improvements])
 
 
@@ -151,24 +145,25 @@ def learner(*improvements: int) -> np.ndarray:
     ("learners", "keep", "expected"),
     [
         ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 4, [[1, 2], [1, 2]]),
-        ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 3, [[1, 2], [1]]),  # the better second one
+        ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 3, [[1, 2], [1]]),  # 30 is more than 25
         ([learner(10, 20), learner(90, 80, 70, 60)], 3, [[1], [0, 1]]),
-        ([learner(30, 20, 40, 50), learner(0, 5, 4, 0)], 4, [[3, 2, 0], [1]]),  # the other has one only
+        (
+            [learner(30, 20, 40, 50), learner(0, 5, 4, 0)],
+            4,
+            [[3, 2, 0], [1]],
+        ),  # only one of the second learner improves by 5
         ([learner(30, 20, 40, 50), learner(0, 0)], 8, [[3, 2, 0, 1], []]),
         ([learner(0), learner(0)], 2, [[], []]),
         ([learner(9), learner(7), learner(8)], 2, [[0], [], [0]]),
     ],
 )
-def test_streams_are_shared_out_among_learners(learners, keep, expected):
+def test_selected_streams_are_divided_among_learners(learners, keep, expected):
     assert [streams.tolist() for streams in curate.select_streams(learners, keep, 5.0)] == expected
-
-
-# Labels
 
 
 @pytest.fixture(scope="module")
 def labelled():
-    """Return two streams of two episodes; the labels, and every step's logits under three ways to carry the memory."""
+    """Return labels of two streams of two episodes, and logits with the memory reset by episode, by step, or never."""
     widths = Widths(pointwise=(8,), spatial=(8,), dense=32, gru=16, head=16)
     network = ActorCritic(widths)
     rng = np.random.default_rng(3)
@@ -176,7 +171,7 @@ def labelled():
     obs = observe(LAYOUT, states, EGO)
     tree = jax.eval_shape(lambda key: network.untrained(key, LAYOUT.channels), jax.random.key(0))
 
-    def random(weight) -> np.ndarray:  # actions as different as the states
+    def random(weight) -> np.ndarray:  # makes actions vary with states
         if len(weight.shape) == 1:
             return np.zeros(weight.shape, np.float32)
         return (rng.normal(size=weight.shape) * 2 / np.prod(weight.shape[:-1]) ** 0.5).astype(np.float32)
@@ -200,17 +195,17 @@ def labelled():
     return labels, {name: logits_with_memory_from(starts) for name, starts in ways.items()}
 
 
-def test_labels_equal_the_network_stepped_through_each_episode(labelled):
+def test_labels_are_greedy_actions_with_the_memory_of_the_episode(labelled):
     labels, logits = labelled
     assert [(label.shape, label.dtype) for label in labels] == [((200,), np.int8)] * 2
     chosen = np.take_along_axis(logits["episode"], np.stack(labels)[..., None].astype(int), axis=-1)[..., 0]
-    # Two sums in another order: an action that is best up to rounding is a right label.
+    # Sums in another order round differently, so any action within rounding of the best one is a correct label.
     np.testing.assert_allclose(chosen, logits["episode"].max(axis=-1), rtol=0, atol=1e-4)
     assert len(np.unique(labels)) > 2
 
 
-def test_labels_need_the_memory_and_its_restart(labelled):
-    """Logits differ if the memory is dropped at every step or carried into the next episode."""
+def test_labels_depend_on_memory_within_an_episode(labelled):
+    """Labels differ from actions with the memory reset at every step, or carried into the next episode."""
     labels, logits = labelled
     without, across = (logits[way].argmax(axis=-1) for way in ("step", "never"))
     assert (np.stack(labels) != without).mean() > 0.1

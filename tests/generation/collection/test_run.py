@@ -1,4 +1,4 @@
-"""All tasks of a rebuild: missing ones, two collectors at once, Ray."""
+"""Collection of all tasks of a rebuild: missing tasks, two processes at once, and workers on Ray."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def tasks(built):
     return profile.units(), profile
 
 
-def test_waiting_for_the_other_collector(tasks, built, tmp_path):
-    """A task that the other collector finishes is not repeated."""
+def test_task_collected_by_another_process_is_waited_for(tasks, built, tmp_path):
+    """A task that another process finishes in the meantime is not collected again."""
     work, profile = tasks[0][0], tasks[1]
     folder = tmp_path / "artefacts" / work.name
     folder.parent.mkdir()
@@ -46,7 +46,7 @@ def test_waiting_for_the_other_collector(tasks, built, tmp_path):
     assert (folder / "metadata.json").stat().st_mtime_ns == before
 
 
-def test_exit_code_1_and_nothing_packed_if_a_task_is_missing(tasks, built, tmp_path, monkeypatch, capsys):
+def test_unfinished_task_gives_exit_code_1_and_no_release(tasks, built, tmp_path, monkeypatch, capsys):
     shutil.copytree(built / "a" / "artefacts", tmp_path / "artefacts")
     partial = partial_folder(tmp_path / "artefacts" / tasks[0][1].name)
     partial.mkdir()
@@ -63,7 +63,7 @@ def test_exit_code_1_and_nothing_packed_if_a_task_is_missing(tasks, built, tmp_p
 
 
 @pytest.mark.slow
-def test_two_collectors_at_once_do_each_task_once(built, pair, tmp_path):
+def test_two_generate_commands_at_once_collect_each_task_once(built, pair, tmp_path):
     command = ["-m", "icrl4aht_data", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
     processes = [start(*command) for _ in range(2)]
     outputs = [process.communicate() for process in processes]
@@ -74,8 +74,8 @@ def test_two_collectors_at_once_do_each_task_once(built, pair, tmp_path):
     assert not compare_rebuilds(tmp_path, pair).differences
 
 
-def listening(process: psutil.Process) -> set[str]:
-    """Return the addresses that a process and its children listen on."""
+def listening_addresses(process: psutil.Process) -> set[str]:
+    """Return the IP addresses on which a process and its children listen."""
     found = set()
     for child in [process, *process.children(recursive=True)]:
         try:
@@ -86,9 +86,9 @@ def listening(process: psutil.Process) -> set[str]:
 
 
 @pytest.mark.slow
-def test_ray_with_two_workers(built, pair, tmp_path):
-    """A damaged task fails and the other is finished; then both, bit-equal to the collection in one process; all that
-    time, nothing listens beyond the loopback."""
+def test_two_ray_workers_collect_bit_equal_tasks(built, pair, tmp_path):
+    """A damaged task fails and the other task finishes; after a repair both tasks equal those collected in one process.
+    Meanwhile, no process listens on addresses other than the loopback."""
     broken = partial_folder(tmp_path / "artefacts" / artefact(pair, 1).name)
     broken.mkdir(parents=True)
     (broken / LEARNER).write_bytes(b"junk")
@@ -97,8 +97,8 @@ def test_ray_with_two_workers(built, pair, tmp_path):
     addresses: set[str] = set()
     process = start(*command)
     while process.poll() is None:
-        addresses |= listening(psutil.Process(process.pid))
-        time.sleep(0.5)  # reading all connections takes CPU time
+        addresses |= listening_addresses(psutil.Process(process.pid))
+        time.sleep(0.5)  # listing all connections takes much CPU time
     output, errors = process.communicate()
     assert process.returncode == 1, output + errors
     assert "1 of 2 jobs are unfinished" in errors
@@ -117,13 +117,13 @@ def test_ray_with_two_workers(built, pair, tmp_path):
     assert all(ipaddress.ip_address(address.removeprefix("::ffff:")).is_loopback for address in addresses), addresses
 
 
-def test_workers_of_a_cluster_are_its_own(tmp_path):
+def test_number_of_workers_for_an_existing_ray_cluster_raises_error(tmp_path):
     jobs = [FileJob(tmp_path, "one")]
     with pytest.raises(OptionError, match="workers = 2: the Ray at there:6379 sets its own number"):
         run_jobs(jobs, tmp_path, Console(), QueueOptions(executor="ray", address="there:6379", workers=2))
 
 
-def test_the_board_counts_tasks_updates_and_speed():
+def test_job_board_shows_jobs_updates_and_speed():
     shown = []
     board = JobBoard(lambda *bar: shown.append(bar), {"one": 10, "two": 10})
     board.show_running("one", 5, 1_000.0)

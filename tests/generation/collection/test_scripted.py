@@ -1,4 +1,4 @@
-"""Histories that scripts play: actions, keys of episodes, memory, and results that do not depend on pieces."""
+"""Histories that scripted egos play: actions, noise, labels, and independence of the batches of episodes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ pytestmark = pytest.mark.usefixtures("short_pieces")
 
 @pytest.fixture(scope="module")
 def short_pieces():
-    """Tasks of 40 episodes in three pieces, the last one half filled."""
+    """Play the 40 episodes of a task in three batches of 16; the last batch is half filled."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scripted_rollout, "EPISODES_AT_ONCE", PIECE)
         yield
@@ -58,16 +58,16 @@ def profile(tmp_path_factory) -> Profile:
 
 
 @pytest.fixture(scope="module")
-def made(profile, short_pieces, tmp_path_factory) -> Path:
-    """Return a finished artefact."""
+def noise_artefact(profile, short_pieces, tmp_path_factory) -> Path:
+    """Return the folder of a collected task with noise histories."""
     job = CollectionJob(WORK, profile, tmp_path_factory.mktemp("noise"))
     job.run()
     return job.folder
 
 
 @pytest.fixture(scope="module")
-def arrays(made) -> dict[str, np.ndarray]:
-    return {path.stem: np.load(path) for path in made.glob("*.npy")}
+def arrays(noise_artefact) -> dict[str, np.ndarray]:
+    return {path.stem: np.load(path) for path in noise_artefact.glob("*.npy")}
 
 
 def stop_after(pieces: int) -> OnUpdate:
@@ -78,7 +78,7 @@ def stop_after(pieces: int) -> OnUpdate:
     return report
 
 
-def test_the_arrays(arrays, made, profile):
+def test_noise_artefact_has_arrays_of_expected_shapes_and_size(arrays, noise_artefact, profile):
     size = 24
     assert {name: (array.shape, str(array.dtype)) for name, array in arrays.items()} == {
         "state": ((4, 1000, size), "uint8"),
@@ -89,40 +89,40 @@ def test_the_arrays(arrays, made, profile):
         "script_actions": ((4, 1000), "int8"),
         "noise": ((4, 10), "float32"),
     }
-    stored = sum(path.stat().st_size for path in made.iterdir() if path.name != METADATA)
+    stored = sum(path.stat().st_size for path in noise_artefact.iterdir() if path.name != METADATA)
     assert stored == pytest.approx(scripted_bytes(LAYOUT, profile.noise), abs=2_000)
 
 
-def test_every_step_follows_the_rules(arrays):
+def test_every_recorded_step_follows_the_rules(arrays):
     states = arrays["state"].reshape(40, 100, -1)
     after = np.concatenate([states[:, 1:], arrays["episode_end_state"].reshape(40, 1, -1)], axis=1)
     actions = np.stack([arrays["actions"], arrays["teammate_actions"]], axis=-1).reshape(40, 100, 2).astype(int)
     found = step(LAYOUT, states, actions, after[..., 6])
     np.testing.assert_array_equal(found.state, after)
     np.testing.assert_array_equal(found.reward, arrays["rewards"].reshape(40, 100))
-    assert len(np.unique(states[:, 0], axis=0)) > 30, "episodes start in states of their own"
+    assert len(np.unique(states[:, 0], axis=0)) > 30, "episodes start in different states"
 
 
-def test_actions_are_the_oracles_except_for_noise(arrays):
-    """One in six random actions equals the oracle's."""
+def test_actions_equal_oracle_actions_except_for_noise(arrays):
+    """By chance, one in six random actions equals the action of the oracle."""
     clean = (arrays["actions"] == arrays["script_actions"]).reshape(40, 100)
     expected = 1 - arrays["noise"].reshape(40, 1) * 5 / 6
     assert clean[expected[:, 0] == 1].all()
     assert abs(clean.mean() - expected.mean()) < 4 * np.sqrt((expected * (1 - expected)).sum() / 40 / 4000)
-    noisy = arrays["actions"].reshape(40, 100)[~clean]  # only random actions differ
+    noisy = arrays["actions"].reshape(40, 100)[~clean]  # all of them are random actions
     assert (np.bincount(noisy, minlength=6) > 0.1 * len(noisy)).all()
 
 
-def test_labels_are_those_of_an_oracle_that_watches_the_episode(arrays):
+def test_labels_equal_oracle_labels_of_recorded_states_and_actions(arrays):
     found = [oracle_labels(LAYOUT, *one) for one in zip(arrays["state"], arrays["actions"], strict=True)]
     np.testing.assert_array_equal(found, arrays["script_actions"])
 
 
-def test_an_episode_is_a_function_of_its_numbers(arrays):
-    """An episode is the same in a mixed batch as in its task."""
+def test_episode_depends_only_on_seed_history_and_episode_number(arrays):
+    """Episodes of several histories in one batch are equal to those of the task."""
     mate = build_teammate(None, MATE)
     history, episode = np.array([3, 1, *[0] * 14]), np.array([2, 9, *range(14)])
-    chances = np.concatenate([arrays["noise"], arrays["noise"]], axis=1)  # episodes 10 to 13 have chances, too
+    chances = np.concatenate([arrays["noise"], arrays["noise"]], axis=1)  # noise for episodes 10 to 13 too
 
     def play(seed):
         return next(play_scripted_histories(LAYOUT, mate, seed, "noise", [(history, episode)], chances))[1]
@@ -137,15 +137,15 @@ def test_an_episode_is_a_function_of_its_numbers(arrays):
 
 
 @pytest.mark.slow
-def test_the_bits_do_not_depend_on_the_piece(made, profile, tmp_path, monkeypatch):
+def test_histories_do_not_depend_on_the_batch_size(noise_artefact, profile, tmp_path, monkeypatch):
     monkeypatch.setattr(scripted_rollout, "EPISODES_AT_ONCE", 23)
     job = CollectionJob(WORK, profile, tmp_path)
     job.run()
-    assert not compare_rebuilds(job.folder, made).differences
+    assert not compare_rebuilds(job.folder, noise_artefact).differences
 
 
-def test_schedules():
-    """Schedules follow the formula and ranges, and each history's draw is independent of the others."""
+def test_noise_schedules_follow_their_settings():
+    """Schedules follow the formula and the ranges; a history's schedule does not depend on the number of histories."""
     linear = noise_schedules(NoiseConfig(histories=2, episodes=11), 0)
     np.testing.assert_allclose(linear, [np.linspace(1, 0, 11)] * 2, atol=1e-6)
     steep = NoiseConfig(histories=1, episodes=11, begin=(0.2, 0.2), finish=(0.6, 0.6), power=(2, 2), end=(0.1, 0.1))
@@ -161,30 +161,30 @@ def test_schedules():
     assert 0 <= drawn[:, -1].min() < 0.05 < 0.15 < drawn[:, -1].max() <= 0.2
     np.testing.assert_array_equal(noise_schedules(NoiseConfig(histories=9, episodes=30, **ranges), 3), drawn[:9])
     assert not np.array_equal(noise_schedules(NoiseConfig(histories=50, episodes=30, **ranges), 4), drawn)
-    # The number of an episode does not tell its chance.
+    # Histories have different noise at the same episode number.
     assert np.ptp(drawn[:, 15]) > 0.5
 
 
-def test_a_stopped_task_is_made_again(made, profile, tmp_path):
+def test_stopped_scripted_task_starts_again_with_equal_result(noise_artefact, profile, tmp_path):
     job, seen = CollectionJob(WORK, profile, tmp_path), []
     with pytest.raises(KeyboardInterrupt):
         job.run(stop_after(2))
     assert (partial_folder(job.folder) / "rewards.npy").exists()
     job.run(lambda done, speed: seen.append(done))
     assert seen == [1, 2, 3]
-    assert not compare_rebuilds(job.folder, made).differences
+    assert not compare_rebuilds(job.folder, noise_artefact).differences
     assert not partial_folder(job.folder).exists()
 
 
-def test_wall_clock_figures_are_apart_from_what_is_hashed(made):
-    assert TIMING not in json.loads((made / METADATA).read_text())["files"]
-    timing = last_timing(made)
+def test_timing_file_is_not_in_the_hashed_metadata(noise_artefact):
+    assert TIMING not in json.loads((noise_artefact / METADATA).read_text())["files"]
+    timing = last_timing(noise_artefact)
     assert timing is not None
     assert timing["update"] == 2
     assert 0 < timing["recording"] < timing["seconds"]
 
 
-def test_a_full_disk_leaves_no_files(profile, tmp_path):
+def test_full_disk_leaves_no_files_of_a_scripted_task(profile, tmp_path):
     def fill(pieces, speed):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -194,8 +194,8 @@ def test_a_full_disk_leaves_no_files(profile, tmp_path):
     assert not partial_folder(job.folder).exists()
 
 
-def searched(profile: Profile, folder: Path, dish: tuple[int, int, int]) -> dict[str, np.ndarray]:
-    """Return histories of the searcher in a task with one wanted dish, whose teammate only watches."""
+def search_histories(profile: Profile, folder: Path, dish: tuple[int, int, int]) -> dict[str, np.ndarray]:
+    """Return histories of the searching script in a task with one wanted recipe and a teammate that only watches."""
     work = Work(make_task("preference", "train", "asymm_both_plain", WATCHER, 5, [dish]), "search")
     job = CollectionJob(work, profile, folder)
     job.run()
@@ -203,20 +203,20 @@ def searched(profile: Profile, folder: Path, dish: tuple[int, int, int]) -> dict
     return {path.stem: np.load(path) for path in job.folder.glob("*.npy")}
 
 
-def test_a_searcher_finds_the_dish_and_remembers_it(profile, tmp_path):
+def test_searching_script_finds_and_remembers_the_wanted_recipe(profile, tmp_path):
     config = replace(SEARCH, histories=8, episodes=10, start=(0.0, 0.0))
     exact = replace(profile, search=config)
-    one, other = (searched(exact, tmp_path, dish) for dish in ((0, 0, 0), (1, 1, 1)))
+    one, other = (search_histories(exact, tmp_path, dish) for dish in ((0, 0, 0), (1, 1, 1)))
     for found in (one, other):
         np.testing.assert_array_equal(found["actions"], found["script_actions"])
         returns = found["rewards"].reshape(8, 10, 100).sum(axis=-1)
         for own in found["rewards"]:
-            assert (own < 0).sum() < len(all_dishes(get_layout("asymm_both_plain"))), "a dish is refused once at most"
-            assert not (own[(own > 0).argmax() :] < 0).any(), "no refusal after the first dish that was paid"
+            assert (own < 0).sum() < len(all_dishes(get_layout("asymm_both_plain"))), "a dish is refused at most once"
+            assert not (own[(own > 0).argmax() :] < 0).any(), "no wrong delivery after the first correct one"
         assert (returns[:, 5:] > 0).all(), returns
         assert returns[:, 5:].mean() > returns[:, 0].mean() + 20
         assert (returns[:, 0] < 0).any(), "some histories begin with a wrong dish"
-    # Nothing tells the dish before the first delivery.
+    # Before the first delivery, actions do not depend on the wanted recipe, which is not shown.
     delivered = np.minimum(*((found["rewards"] != 0).argmax(axis=1) for found in (one, other)))
     assert (delivered > 10).all()
     for history, step_ in enumerate(delivered):
@@ -224,7 +224,7 @@ def test_a_searcher_finds_the_dish_and_remembers_it(profile, tmp_path):
     assert any(not np.array_equal(a, b) for a, b in zip(one["actions"], other["actions"], strict=True))
 
 
-def test_a_search_history_has_one_chance_until_its_end():
+def test_noise_of_a_search_history_is_constant_until_its_last_episode():
     chances = noise_schedules(replace(SEARCH, histories=50), 0)
     assert (chances[:, :-1] == chances[:, :1]).all()
     assert chances.min() >= 0
@@ -233,8 +233,8 @@ def test_a_search_history_has_one_chance_until_its_end():
 
 
 @pytest.mark.slow
-def test_histories_with_a_learned_teammate(profile, tmp_path):
-    """A learned teammate acts greedily on its observations."""
+def test_scripted_histories_can_have_a_learned_teammate(profile, tmp_path):
+    """The learned teammate takes the greedy actions of its policy."""
     save(tmp_path / "suite/member", LAYOUT)
     mate = entry(tmp_path / "suite", "member")
     work = Work(make_task("teammate", "train", "demo_wide", mate, 3), "noise")
@@ -249,8 +249,8 @@ def test_histories_with_a_learned_teammate(profile, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_commands(tmp_path):
-    """A release generated in one process, then its tasks on Ray, with the same bits; the release is valid."""
+def test_generate_check_and_verify_commands_accept_scripted_histories(tmp_path):
+    """A release generated in one process is valid, and its tasks collected again on Ray give the same bits."""
     (tmp_path / "noise.toml").write_text(NOISE)
     command = ("-m", "icrl4aht_data", "generate", "--profile", str(tmp_path / "noise.toml"), "--out")
     again = ("--tasks", str(tmp_path / "a/lite/meta/tasks.jsonl"), "--executor", "ray", "--workers", "1")

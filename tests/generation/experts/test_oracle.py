@@ -1,4 +1,4 @@
-"""The scripted oracle: no wrong deliveries, and a higher return than H4 as the ego."""
+"""The scripted oracle ego: it makes no wrong deliveries and earns more than H4 in the ego's slot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=2)
 TASKS = [task for track in TRACKS for task in published_tasks(track)]
 
 FAMILY_ON = {
-    # One family per layout, chosen so that the ego meets teammates that cook, block, deliver only, and wander.
+    # One family for each layout; together the teammates cook, block, only deliver, or wander.
     "coord_simple": "H4",
     "coord_ring": "H2",
     "test_simple": "H3",
@@ -40,13 +40,13 @@ FAMILY_ON = {
 }
 
 
-def by_layout(*names: str) -> list[Any]:
-    """Return parameters of a test: asymm_right by default, one room for both; the others in the slow suite."""
+def layout_params(*names: str) -> list[Any]:
+    """Return test parameters for layouts; all but asymm_right are marked slow."""
     return [pytest.param(name, marks=[] if name == "asymm_right" else [pytest.mark.slow]) for name in names]
 
 
 def h4(layout: Layout) -> Policy:
-    """Heuristic H4 in the ego's agent slot."""
+    """Return the heuristic H4 in the ego's slot."""
     return build_teammate(layout, published_teammates(layout.name, "utility_greedy")[0], EGO)
 
 
@@ -60,35 +60,35 @@ def episodes(agent: str, layout: str) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return record, actions, reward
 
 
-@pytest.mark.parametrize("layout", by_layout(*FAMILY_ON))
-def test_it_never_presses_and_never_delivers_wrongly(layout):
+@pytest.mark.parametrize("layout", layout_params(*FAMILY_ON))
+def test_oracle_never_presses_buttons_or_delivers_wrong_dishes(layout):
     record, actions, _ = episodes("oracle", layout)
     events = step(LAYOUTS[layout], record, actions, record[..., 6]).events[..., EGO]
     assert not (events & (PRESSED | WRONG)).any()
 
 
-@pytest.mark.parametrize("layout", by_layout("coord_simple", "test_simple"))
-def test_it_stays_where_the_rooms_share_nothing(layout):
+@pytest.mark.parametrize("layout", layout_params("coord_simple", "test_simple"))
+def test_oracle_stays_if_the_agents_can_share_no_items(layout):
     assert (episodes("oracle", layout)[1][..., EGO] == STAY).all()
 
 
-@pytest.mark.parametrize("layout", by_layout("test_wide", "asymm_right", "cramped_down"))
-def test_it_earns_more_than_h4_in_its_slot(layout):
+@pytest.mark.parametrize("layout", layout_params("test_wide", "asymm_right", "cramped_down"))
+def test_oracle_earns_more_than_h4_in_the_same_slot(layout):
     oracle, other = (episodes(agent, layout)[2].sum(axis=1).mean() for agent in ("oracle", "h4"))
     assert oracle > other
 
 
 @pytest.mark.slow
-def test_it_delivers_dishes_that_the_teammate_leaves_on_shared_counters():
-    """On coord_ring H2's counter-parker plates soups and never delivers; the ego has no pot of its own."""
+def test_oracle_delivers_dishes_that_the_teammate_put_on_counters():
+    """On coord_ring the H2 teammate plates soups without delivering them, and the ego cannot reach a pot."""
     record, actions, _ = episodes("oracle", "coord_ring")
     delivered = step(LAYOUTS["coord_ring"], record, actions, record[..., 6]).events[..., EGO] & CORRECT > 0
     assert delivered.sum() > 0
 
 
 @pytest.mark.slow
-def test_it_never_splits_a_recipe_over_two_pots():
-    layout = LAYOUTS["test_wide"]  # the teammate reaches no ingredient of any recipe: both pots are the ego's work
+def test_oracle_fills_only_one_pot_at_a_time():
+    layout = LAYOUTS["test_wide"]  # the teammate reaches no ingredient of any recipe, so only the ego fills pots
     state = unpack(layout, episodes("oracle", "test_wide")[0])
     contents = state.pot_items & (0xFF - COOKED)
     begun = (ingredient_count(contents) > 0) & (ingredient_count(contents) < 3)
@@ -101,8 +101,8 @@ def _counts(items: np.ndarray) -> np.ndarray:
     return (items[..., None] >> np.array([2, 4, 6]) & 3).astype(int)
 
 
-def test_it_is_deterministic():
-    """Equal states and different keys yield equal actions."""
+def test_oracle_is_deterministic():
+    """The oracle takes equal actions in equal states with different random keys."""
     policy = AGENTS["oracle"](LAYOUTS["asymm_right"])
     record = jnp.asarray(episodes("oracle", "asymm_right")[0][0, 0])
     act = jax.jit(lambda key: policy.act(policy.params, policy.init(policy.params, key), record, key)[0])

@@ -1,4 +1,4 @@
-"""The queue: local processes, failures, further attempts, jobs of other processes."""
+"""The job queue: local processes, failures, retries, and jobs that other processes run."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def failures(out: Path) -> list[dict]:
 
 
 def tries(out: Path, *names: str) -> list[int]:
-    """Return how often jobs were begun."""
+    """Return the number of attempts of each job."""
     return [len(path.read_text()) if (path := out / f"{name}.tries").exists() else 0 for name in names]
 
 
-def test_a_failing_job_is_reported_and_others_finish(tmp_path):
+def test_failed_job_is_reported_and_other_jobs_finish(tmp_path):
     jobs = [FileJob(tmp_path, "bad", failures=1), FileJob(tmp_path, "good")]
     with pytest.raises(FailedJobsError, match=r"1 of 2 jobs are unfinished: bad; .*failed\.jsonl lists the reasons"):
         run(jobs, tmp_path)
@@ -52,7 +52,7 @@ def test_a_failing_job_is_reported_and_others_finish(tmp_path):
     assert not failures(tmp_path)
 
 
-def test_retries(tmp_path):
+def test_failed_jobs_are_retried(tmp_path):
     run([FileJob(tmp_path, "later", failures=2)], tmp_path, retries=2)
     with pytest.raises(FailedJobsError):
         run([FileJob(tmp_path, "bad", failures=9), FileJob(tmp_path, "good")], tmp_path, retries=2)
@@ -60,14 +60,14 @@ def test_retries(tmp_path):
     assert [line["attempts"] for line in failures(tmp_path)] == [3]
 
 
-def test_fail_fast(tmp_path):
+def test_fail_fast_stops_at_the_first_failure(tmp_path):
     with pytest.raises(FailedJobsError, match=r"failed\.jsonl: stopped after the first failure: ValueError: attempt 1"):
         run([FileJob(tmp_path, "bad", failures=9), FileJob(tmp_path, "good")], tmp_path, fail_fast=True)
     assert tries(tmp_path, "bad", "good") == [1, 0]
     assert len(failures(tmp_path)) == 1
 
 
-def test_an_interrupt_is_no_failure(tmp_path, monkeypatch):
+def test_interrupted_job_is_not_reported_as_failed(tmp_path, monkeypatch):
     def interrupt(*arguments) -> None:
         raise KeyboardInterrupt
 
@@ -77,14 +77,14 @@ def test_an_interrupt_is_no_failure(tmp_path, monkeypatch):
     assert not failures(tmp_path)
 
 
-def test_jobs_of_another_process_come_last(tmp_path):
+def test_jobs_that_another_process_runs_come_last(tmp_path):
     printed = run([FileJob(tmp_path, "busy", busy=True), FileJob(tmp_path, "good")], tmp_path)
     works, good, busy = (printed.index(text) for text in ("1/2 busy: another process", "2/2 good: f", "1/2 busy: f"))
     assert works < good < busy
 
 
-def test_local_processes(tmp_path):
-    """Two workers: one job fails once and is tried again, one always fails, one is killed."""
+def test_jobs_in_local_processes_are_retried_and_reported(tmp_path):
+    """Run four jobs in two processes: a busy one, one that fails once, one that always fails, and a killed one."""
     jobs = [FileJob(tmp_path, "killed", killed=True), FileJob(tmp_path, "busy", busy=True)]
     jobs += [FileJob(tmp_path, "bad", failures=9), FileJob(tmp_path, "later", failures=1)]
     with pytest.raises(FailedJobsError, match=r"2 of 4 jobs are unfinished: bad, killed; .*lists the reasons"):
@@ -103,8 +103,8 @@ def test_local_processes(tmp_path):
     assert (tmp_path / "bad").read_text() == str(os.getpid())
 
 
-def test_quick_jobs_share_processes(tmp_path):
-    """A job with another number of threads of XLA, or one that is not quick, has a process of its own."""
+def test_quick_jobs_share_worker_processes(tmp_path):
+    """A job with another number of XLA threads, or a job that is not quick, gets a new process."""
     jobs = [FileJob(tmp_path, f"{number}") for number in range(5)] + [FileJob(tmp_path, "other", xla_threads=2)]
     jobs += [FileJob(tmp_path, name, xla_threads=3, is_quick=False) for name in ("long", "longer")]
     run(jobs, tmp_path, workers=2)
@@ -113,12 +113,12 @@ def test_quick_jobs_share_processes(tmp_path):
     assert len({pids[0], *pids[5:]}) == 4
 
 
-def test_a_stopped_training_can_be_passed_between_processes():
+def test_training_stopped_error_can_be_pickled():
     stopped = pickle.loads(pickle.dumps(TrainingStopped(signal.SIGTERM, "saved")))
     assert (stopped.code, str(stopped)) == (143, "saved")
 
 
-def test_jobs_of_a_rebuild_have_names_and_updates(tmp_path):
+def test_jobs_of_a_rebuild_have_unique_names_and_numbers_of_updates(tmp_path):
     profile = load_profile("smoke")
     populations = population_runs(profile, {"demo_wide": ["fcp"]}, 0)
     jobs = [CollectionJob(work, profile, tmp_path) for work in profile.units()]

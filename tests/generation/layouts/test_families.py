@@ -1,4 +1,4 @@
-"""Generated layouts: a function of family, seed and number; new under symmetry; disjoint splits; the command."""
+"""Generated layouts: determined by family, seed and number, distinct under symmetry, and in disjoint splits."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ GOLDEN = {
     "templates": "8d9cf816e96a2fd62fa753634665d38b1aab1c314359a1b01618f991b291956f",
     "rooms": "7e06a247d88cf498b04367eeafd1c94d22c66c16682a715ea5744f381e5fc82e",
 }
-"""SHA-256 of the first 40 layouts of seed 0: layouts that were published or trained on must never change."""
+"""SHA-256 of the first 40 layouts of seed 0 of each family, which must not change after publication."""
 
 EVERY_FAMILY = pytest.mark.parametrize("family", LAYOUT_FAMILIES)
 
 
 @pytest.fixture(scope="module")
 def drawn() -> dict[str, list[Layout]]:
-    """800 layouts of each family."""
+    """Return 800 generated layouts of each family."""
     return {family: generate_layouts(family, 0, 800) for family in LAYOUT_FAMILIES}
 
 
@@ -49,38 +49,38 @@ def content(layouts: list[Layout]) -> list[tuple]:
 
 
 @EVERY_FAMILY
-def test_layouts_never_change(family, drawn):
+def test_generated_layouts_have_the_stored_hash(family, drawn):
     text = repr(content(drawn[family][:40]) + [split_of(one) for one in drawn[family][:40]])
     assert hashlib.sha256(text.encode()).hexdigest() == GOLDEN[family]
 
 
 @EVERY_FAMILY
-def test_more_layouts_begin_with_the_same_ones(family, drawn):
+def test_first_generated_layouts_do_not_depend_on_the_count(family, drawn):
     assert content(generate_layouts(family, 0, 30)) == content(drawn[family][:30])
     assert [one.rows for one in generate_layouts(family, 1, 5)] != [one.rows for one in drawn[family][:5]]
     assert generate_layouts(family, 0, 0) == []
 
 
 @EVERY_FAMILY
-def test_a_name_alone_rebuilds_a_layout(family, drawn):
+def test_generated_layout_is_found_by_its_name(family, drawn):
     assert content([find_generated(f"{family}-0-7")]) == content(drawn[family][7:8])
 
 
 @EVERY_FAMILY
-def test_no_two_are_equal_under_symmetry(family, drawn):
+def test_no_two_layouts_are_equal_under_symmetry(family, drawn):
     maps = [canonical_map(get_layout(name)) for name in LAYOUT_NAMES] + [canonical_map(one) for one in drawn[family]]
     assert len(set(maps)) == len(maps)
 
 
 @EVERY_FAMILY
-def test_every_layout_is_solvable(family, drawn):
+def test_every_generated_layout_is_solvable(family, drawn):
     for layout in drawn[family]:
         check_solvable(layout)
 
 
 @pytest.mark.parametrize("family", ["templates", "rooms"])
-def test_fixtures_and_recipes(family, drawn):
-    """Fixtures are on walls that an agent can face; a layout has 4 to 6 more than it needs, in small rooms fewer."""
+def test_generated_layouts_have_allowed_fixtures_and_recipes(family, drawn):
+    """Agents can face all fixtures; a layout has 4 to 6 fixtures more than needed, or fewer if there is no space."""
     shown = set()
     for layout in drawn[family]:
         grid, types = grid_of(layout), layout.ingredients
@@ -96,16 +96,16 @@ def test_fixtures_and_recipes(family, drawn):
     assert len(shown) == 8, "with and without recipe indicators, buttons and the delivery indicator"
 
 
-def test_rooms_are_new_and_small(drawn):
+def test_layouts_of_family_rooms_are_small_and_a_third_separates_agents(drawn):
     published = published_rooms(False) | published_rooms(True)
-    assert len(published) == 7  # asymm_*, cramped_* and coord_simple with test_simple share rooms
+    assert len(published) == 7  # some layouts, such as coord_simple and test_simple, have equal floor
     for layout in drawn["rooms"]:
         assert layout.height <= MOST_ROWS and layout.width <= MOST_COLUMNS
     shared = [np.array_equal(*layout.rooms) for layout in drawn["rooms"][:300]]
     assert shared == [True, False, True] * 100
 
 
-def test_canonical_map_is_that_of_every_symmetric_layout(drawn):
+def test_symmetric_layouts_have_equal_canonical_map_and_split(drawn):
     for layout in (get_layout("asymm_both"), get_layout("cramped_up"), *drawn["rooms"][:20], *drawn["templates"][:20]):
         images = [
             Layout("", "", tuple(map("".join, grid)), layout.recipes) for grid in symmetric_images(grid_of(layout))
@@ -114,16 +114,16 @@ def test_canonical_map_is_that_of_every_symmetric_layout(drawn):
         assert {split_of(one) for one in images} == {split_of(layout)}
 
 
-def test_starts_in_the_same_rooms_make_no_difference():
+def test_canonical_map_depends_on_start_rooms_but_not_start_cells():
     first = Layout("", "", ("W0PWW", "WA A1", "W   W", "WBWXW"))
     second = Layout("", "", ("W0PWW", "W   1", "WA AW", "WBWXW"))
     one_each = Layout("", "", ("W0PBX1W", "W WA AW", "WWWWWWW"), recipes=((0, 0, 1),))
     other = Layout("", "", ("W0PBX1W", "WAWA  W", "WWWWWWW"), recipes=((0, 0, 1),))
     assert canonical_map(first) == canonical_map(second)
-    assert canonical_map(one_each) != canonical_map(other), "another room has an agent"
+    assert canonical_map(one_each) != canonical_map(other), "an agent starts in another room"
 
 
-def test_splits(drawn):
+def test_generated_layouts_are_split_by_declared_shares(drawn):
     for family, layouts in drawn.items():
         splits = [split_of(one) for one in layouts]
         may_train = np.array([not has_tested_rooms(one) for one in layouts])
@@ -135,8 +135,8 @@ def test_splits(drawn):
         assert content(some) == content([one for one in layouts if split_of(one) == "validation"][:20])
 
 
-def test_rooms_of_test_layouts_are_in_no_training_split(drawn):
-    """Rooms that a layout is only trained on may be: a test layout of the layout track shares them."""
+def test_layouts_with_rooms_of_test_layouts_are_not_for_training(drawn):
+    """Floor shapes of test layouts are excluded, except those that a training layout of the track layout has too."""
     assert {name for name in LAYOUT_NAMES if not has_tested_rooms(get_layout(name))} == {
         *TRACKS["layout"]["train"],
         *TRACKS["layout"]["test"],
@@ -145,7 +145,7 @@ def test_rooms_of_test_layouts_are_in_no_training_split(drawn):
     assert len(tested) == 400 and {split_of(one) for one in tested} == {"validation", "test"}
 
 
-def test_bad_arguments():
+def test_invalid_arguments_of_layout_generation_raise_errors():
     with pytest.raises(UnknownNameError, match=r"unknown family of layouts 'template'.*Did you mean 'templates'"):
         generate_layouts("template", 0, 1)
     with pytest.raises(UnknownNameError, match="unknown split of layouts 'heldout'"):
@@ -161,7 +161,7 @@ def test_bad_arguments():
             find_generated(name)
 
 
-def test_a_family_says_how_many_layouts_it_has(monkeypatch):
+def test_too_few_layouts_of_a_family_raise_error_with_their_number(monkeypatch):
     few = generate_layouts("rooms", 0, 3)
     draws = [(one.rows, one.recipes, False) for one in few]
     monkeypatch.setattr(families, "MOST_REPEATS", 20)
@@ -173,7 +173,7 @@ def test_a_family_says_how_many_layouts_it_has(monkeypatch):
         generate_layouts("few", 0, 4, split="train")
 
 
-def test_the_command_lists_and_draws(tmp_path):
+def test_layouts_command_lists_and_draws_layouts(tmp_path):
     from PIL import Image
 
     sheet = tmp_path / "sheet.png"
@@ -195,8 +195,8 @@ def test_the_command_lists_and_draws(tmp_path):
 
 
 @pytest.mark.slow
-def test_oracles_deliver(drawn, monkeypatch):
-    monkeypatch.setattr(playable, "_AT_ONCE", 4)  # two batches
+def test_oracles_deliver_on_generated_layouts(drawn, monkeypatch):
+    monkeypatch.setattr(playable, "_AT_ONCE", 4)  # plays the layouts in two batches
     idle = Layout("idle", "idle", ("WWWWWW", "WA  WW", "WAW0PB", "WWWWXW"), recipes=((0, 0, 0),))
     layouts = [one for family in LAYOUT_FAMILIES for one in drawn[family][:2]]
     assert playable.layouts_delivered([*layouts, idle]).tolist() == [True] * len(layouts) + [False]

@@ -1,4 +1,4 @@
-"""Rearranged versions of layouts: the draws that stored models were trained on."""
+"""Rearranged versions of layouts, which stored models were trained on."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from icrl4aht_data.overcooked.layouts import get_layout
 TRAINING = TRACKS["layout"]["train"]
 
 
-def reached(layout):
-    """Return the map letters that each set of agents can face."""
+def facing_counts(layout):
+    """Return how many fixtures of each map letter each set of agents can face."""
     found = Counter()
     for cell, letter in enumerate("".join(layout.rows)):
         x, y = cell % layout.width, cell // layout.width
@@ -34,7 +34,7 @@ def reached(layout):
         ("cramped_up", "2afd86e612a34b948b6af41ffae7694f335ba127016689acbab172dd55368299"),
     ],
 )
-def test_draws_are_those_of_stored_models(name, digest):
+def test_rearranged_layouts_have_the_stored_hash(name, digest):
     text = repr([(one.name, one.rows, one.recipes) for one in rearranged_layouts(get_layout(name), 320)])
     assert hashlib.sha256(text.encode()).hexdigest() == digest
 
@@ -45,19 +45,19 @@ def test_rearranged_fixtures_stay_reachable_for_the_same_agents(name):
     others = rearranged_layouts(layout, 6)
     assert len(others) == 6
     for other in others:
-        assert reached(other) == reached(layout)
+        assert facing_counts(other) == facing_counts(layout)
         assert [room.tolist() for room in other.rooms] == [room.tolist() for room in layout.rooms]
     assert [len(other.recipes) for other in others] == [2, 4, 2, 4, 2, 4]
 
 
-def test_too_many_layouts_are_refused():
+def test_more_rearranged_layouts_than_exist_raise_error():
     layout = get_layout("test_wide")
-    few = type(layout)("few", "few", ("W0WBW", "1AWAX", "WWWPW"))  # 3! arrangements of the fixtures in each room
+    few = type(layout)("few", "few", ("W0WBW", "1AWAX", "WWWPW"))  # each room has 3! arrangements of its fixtures
     with pytest.raises(OptionError, match=r"few: found only (\d|[12]\d|3[0-5]) rearranged versions, expected 36"):
         rearranged_layouts(few, 36)
 
 
-def test_four_recipes():
+def test_with_four_recipes_needs_two_ingredients():
     layout = with_four_recipes(get_layout("asymm_both"))
     assert layout.rows == get_layout("asymm_both").rows and len(layout.recipes) == 4
     one_ingredient = type(layout)("one", "one", ("WWWWW", "W0A0W", "WPBXW", "W0A W", "WWWWW"), recipes=((0, 0, 0),))

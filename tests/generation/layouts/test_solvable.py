@@ -1,4 +1,4 @@
-"""Layouts in which a recipe cannot be delivered are refused with the reason, and others are not."""
+"""The check that all recipes of a layout can be cooked and delivered."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HANDOVER = ("W01WPWWW", "WA W  XW", "W  W A W", "WBWWWWWW")
 TWO_FILL = ("W0WPW1WW", "WA P AXW", "W  W  BW", "WWWWWWWW")
 
 
-def made(rows: tuple[str, ...], recipes=ZERO) -> Layout:
+def make_layout(rows: tuple[str, ...], recipes=ZERO) -> Layout:
     return Layout("mine", "mine", rows, recipes)
 
 
@@ -30,12 +30,12 @@ def test_published_layouts_are_solvable(layout):
     ("rows", "recipes"),
     [
         (("W0WPW", "BA AX", "WWWWW"), ZERO),
-        (HANDOVER, MIXED),  # onion and plate go over the counter between the rooms
-        (TWO_FILL, MIXED),  # each agent has an ingredient, and the pot is between them
+        (HANDOVER, MIXED),  # agents hand items over the counter between them
+        (TWO_FILL, MIXED),  # each agent reaches one ingredient, and both reach the pot
     ],
 )
-def test_solvable(rows, recipes):
-    check_solvable(made(rows, recipes))
+def test_layouts_that_need_cooperation_are_solvable(rows, recipes):
+    check_solvable(make_layout(rows, recipes))
 
 
 @pytest.mark.parametrize(
@@ -50,9 +50,9 @@ def test_solvable(rows, recipes):
         (("W0PW1PW", "BA L AB", "WXWWWXW"), MIXED, "the ingredients of recipe (0, 1, 1) cannot reach the same pot"),
     ],
 )
-def test_unsolvable(rows, recipes, reason):
+def test_unsolvable_layout_raises_error_with_the_reason(rows, recipes, reason):
     with pytest.raises(OptionError, match=re.escape(f"layout mine: {reason}; change the map or the recipes")):
-        check_solvable(made(rows, recipes))
+        check_solvable(make_layout(rows, recipes))
 
 
 @pytest.mark.parametrize(
@@ -61,19 +61,19 @@ def test_unsolvable(rows, recipes, reason):
         (HANDOVER, False),
         (TWO_FILL, False),
         (("W0WPW", "1A AX", "WWBWW"), True),
-        (("W01WWWW", "WA P AX", "W  W  B", "WWWWWWW"), True),  # one agent only cooks, the other only serves
-        (("W01WWWW", "WA P AX", "W  W 0B", "WWWWWWW"), False),  # the one that serves would fill the pot as well
-        (("W01PWWWW", "WA PW AX", "WPWP  BW", "WWWWWWWW"), False),  # the one that cooks has a pot of its own
+        (("W01WWWW", "WA P AX", "W  W  B", "WWWWWWW"), True),  # one agent cooks and the other serves
+        (("W01WWWW", "WA P AX", "W  W 0B", "WWWWWWW"), False),  # the serving agent reaches an ingredient too
+        (("W01PWWWW", "WA PW AX", "WPWP  BW", "WWWWWWWW"), False),  # only the cooking agent reaches one of the pots
     ],
 )
-def test_scripted_experts_can_deliver(rows, easy):
-    layout = made(rows, MIXED)
+def test_needs_no_handover_if_scripted_experts_can_deliver(rows, easy):
+    layout = make_layout(rows, MIXED)
     assert needs_no_handover(grid_of(layout), faced_cells(agent_rooms(layout)), MIXED) == easy
 
 
-def test_cells_on_which_an_agent_can_wait():
-    layout = made(("W00WW", "BA AX", "W   W", "WPPWW"))
+def test_waiting_cells_are_not_next_to_needed_fixtures():
+    layout = make_layout(("W00WW", "BA AX", "W   W", "WPPWW"))
     cells = waiting_cells(grid_of(layout), agent_rooms(layout)[0], ZERO)
-    assert cells.tolist() == [7, 13], "not next to the only plates, the goal or a pot"
-    full = made(("WR20W", "P  AW", "L A B", "W1XWW"), ((0, 1, 2),))
+    assert cells.tolist() == [7, 13], "cells next to the only plates, the goal and the pots are excluded"
+    full = make_layout(("WR20W", "P  AW", "L A B", "W1XWW"), ((0, 1, 2),))
     assert len(waiting_cells(grid_of(full), agent_rooms(full)[0], full.recipes)) == 0

@@ -1,4 +1,4 @@
-"""Checkpoints: policies are restored exactly, and rows of zeros take no space."""
+"""Checkpoints of policies: parameters are restored exactly, and rows of zeros take no space."""
 
 import json
 
@@ -24,12 +24,12 @@ def policy():
 
 
 def flat_kernel(folder) -> str:
-    """Name of the matrix whose rows are stored."""
+    """Return the name of the only matrix that is stored by its nonzero rows."""
     (name,) = (name for name in load_file(folder / POLICY_WEIGHTS) if name.endswith("@rows"))
     return name.removesuffix("@rows")
 
 
-def test_rows_of_zeros_take_no_space(policy, tmp_path):
+def test_policy_is_restored_exactly_from_a_small_file(policy, tmp_path):
     network, params = policy
     save_policy(tmp_path / "p", network, params, {"step": 3})
     found, read, card = load_policy(tmp_path / "p")
@@ -48,7 +48,7 @@ def test_rows_of_zeros_take_no_space(policy, tmp_path):
         lambda rows, shape: (rows, [-5, shape[1]]),
     ],
 )
-def test_rows_that_do_not_fit(policy, tmp_path, change):
+def test_checkpoint_with_invalid_row_numbers_raises_error(policy, tmp_path, change):
     network, params = policy
     save_policy(tmp_path / "p", network, params, {})
     name, weights = flat_kernel(tmp_path / "p"), load_file(tmp_path / "p" / POLICY_WEIGHTS)

@@ -1,4 +1,4 @@
-"""Encoders give the same results for observations and for their compact forms."""
+"""Encoders give the same results for observations and for the compact forms of observations."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ LAYOUT = get_layout("demo_wide")
 RECORDS = random_records(LAYOUT, 60, np.random.default_rng(0)).reshape(3, 20, -1)
 
 TOLERANCE = 1e-12
-"""Relative to the largest value, for float64 sums of up to 1,125 terms in another order; the worst seen was 8e-16.
+"""Tolerance relative to the largest value, for float64 sums in different orders; the largest error seen was 8e-16.
 
-A layer norm of few active features magnifies rounding, so float32 could not tell a wrong sum from a rounded one.
+In float32, a layer norm of few active features magnifies rounding so much that it would hide wrong sums.
 """
 
 
@@ -30,7 +30,7 @@ def encoder(kind, view: CompactView | None = None) -> WindowEncoder:
 
 
 def with_gradient(module: WindowEncoder) -> Any:
-    """Features, and the gradient of a weighted sum of them."""
+    """Return a function that computes the gradient of a weighted sum of the features, and the features."""
 
     def total(params, seen):
         features: Any = module.apply(params, seen)
@@ -40,7 +40,7 @@ def with_gradient(module: WindowEncoder) -> Any:
 
 
 @pytest.mark.parametrize("kind", ["words", pytest.param("mlp", marks=pytest.mark.slow)])
-def test_compact_inputs_give_the_results_of_observations(kind):
+def test_compact_inputs_give_the_features_and_gradients_of_observations(kind):
     obs = jnp.asarray(observe(LAYOUT, RECORDS, 0))
     view = CompactView(kind, (LAYOUT,))
     seen = view(jnp.asarray(RECORDS))
@@ -53,7 +53,7 @@ def test_compact_inputs_give_the_results_of_observations(kind):
         params = jax.tree.map(lambda values: values.astype(jnp.float64), params)
         expected_gradient, expected = with_gradient(plain)(params, obs)
         gradient, features = with_gradient(compact)(params, seen)
-        again: Any = jax.jit(compact.apply)(params, obs)  # takes plain observations too, as when acting
+        again: Any = jax.jit(compact.apply)(params, obs)  # observations are accepted too
     assert features.shape == (3, 20, 12) and features.dtype == jnp.float64
     found, wanted = (
         jax.tree.leaves((features, gradient, again)),
@@ -63,8 +63,8 @@ def test_compact_inputs_give_the_results_of_observations(kind):
         np.testing.assert_allclose(one, other, rtol=0, atol=TOLERANCE * np.abs(other).max())
 
 
-def test_only_entries_of_the_layouts_have_random_initial_weights():
-    """Entries that a layout never has start with zero weights, so they add nothing on another layout."""
+def test_only_entries_of_the_layout_have_nonzero_initial_weights():
+    """Entries that are constant on a layout start with zero weights, so they add nothing on other layouts."""
     obs, view = jnp.asarray(observe(LAYOUT, RECORDS, 0)), CompactView("mlp", (LAYOUT,))
     kernels = {}
     for name, module, seen in (
@@ -81,14 +81,14 @@ def test_only_entries_of_the_layouts_have_random_initial_weights():
     np.testing.assert_array_equal(kernels["compact"], expected)
 
 
-def test_agents_of_both_rooms_need_the_entries_of_both():
-    """On demo_wide the rooms are apart: what the teammate sees is no entry of the ego."""
+def test_view_of_both_agents_has_more_entries_than_view_of_the_ego():
+    """On demo_wide the agents stand in separate rooms, so the teammate observes entries that the ego never does."""
     ego, both = (CompactView("mlp", (LAYOUT,), agents) for agents in ((0,), (0, 1)))
     assert len(ego.entries) < len(both.entries)
     assert set(ego.entries) <= set(both.entries)
 
 
-def test_what_the_rules_exclude_is_not_a_number():
+def test_invalid_state_records_give_nan_features():
     view, broken = CompactView("words", (LAYOUT,)), RECORDS.copy()
     broken[1, 4, columns(LAYOUT).hands] = 255
     module = encoder("words", view)

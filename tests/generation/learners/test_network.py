@@ -1,4 +1,4 @@
-"""The network equals a plain Flax form of the same parameters, and its memory restarts at resets."""
+"""The network gives the outputs and gradients of a reference network made of Flax's layers."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from icrl4aht_generation.learners.network import ActorCritic
 STEPS, ENVS, CHANNELS = 4, 3, 40
 
 TOLERANCE = 1e-5
-"""Relative to the largest value. Both forms add up the same float32 products in another order, at most some 1,000 in a
-sum, so a layer is off by a few epsilons (1.2e-7), and eleven layers and four steps carry that on: 1.3e-6 was the worst
-seen. A wrong tap, gate or bias is off by the size of the values themselves."""
+"""Tolerance relative to the largest value. The networks add the same float32 products in different orders, so each
+layer differs by a few epsilons (1.2e-7); over eleven layers and four steps, the largest error seen was 1.3e-6.
+A wrong weight or gate would give errors as large as the values."""
 
 
 class PlainActorCritic(nn.Module):
-    """The network of the paper (App. B.1 and C.2.1) from Flax's own layers; a loop over time."""
+    """The network of the paper (App. B.1 and C.2.1), made of Flax's layers and a Python loop over time."""
 
     widths: Widths
 
@@ -46,7 +46,7 @@ class PlainActorCritic(nn.Module):
 
 
 def plain_names(params: Any, widths: Widths) -> dict[str, Any]:
-    """Return the parameters, or their gradients, under the names of the plain form."""
+    """Return parameters or gradients under the parameter names of `PlainActorCritic`."""
     tree = jax.tree.map(np.asarray, params["params"])
     encoder, gru = tree["encoder"], tree["gru"]
     plain: dict[str, Any] = {name: tree[name] for name in ("actor_hidden", "actor", "critic_hidden", "critic")}
@@ -77,7 +77,7 @@ class Case(NamedTuple):
 
 
 def make_case(widths: Widths) -> Case:
-    """Return random parameters, none of them zero, and a sequence with three resets."""
+    """Return a network with random nonzero parameters, and a sequence of observations with three resets."""
     network = ActorCritic(widths)
     rng = np.random.default_rng(1)
     shape = (STEPS, ENVS, 5, 5, CHANNELS)
@@ -101,31 +101,31 @@ def paper() -> Case:
 
 @pytest.fixture(scope="module")
 def small() -> Case:
-    """Return a case with other numbers of layers and unequal widths."""
+    """Return a small network with unequal widths, and a sequence of observations."""
     return make_case(Widths(pointwise=(6,), spatial=(3, 5), dense=11, gru=7, head=9))
 
 
 def assert_close(found: Any, expected: Any, what: str = "") -> None:
-    """Compare arrays, to `TOLERANCE` times the largest value."""
+    """Assert that arrays are equal up to `TOLERANCE` times the largest value."""
     size = np.abs(np.asarray(expected)).max()
     assert size > 0, what
     np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE * size, err_msg=what)
 
 
-def test_number_of_parameters():
+def test_network_has_the_expected_number_of_parameters():
     params = jax.eval_shape(lambda key: ActorCritic(Widths()).untrained(key, CHANNELS), jax.random.key(0))
     assert sum(w.size for w in jax.tree.leaves(params)) == 273_375
 
 
 @pytest.mark.parametrize("which", [pytest.param("paper", marks=pytest.mark.slow), "small"])
-def test_outputs_and_gradients_equal_the_plain_form(which, request):
+def test_outputs_and_gradients_equal_those_of_the_reference_network(which, request):
     case: Case = request.getfixturevalue(which)
     plain = PlainActorCritic(case.network.widths)
     names = plain_names(case.params, case.network.widths)
     weights = jax.random.normal(jax.random.key(4), (STEPS, ENVS, 7))
 
     def both(network):
-        """Outputs, and the gradients of a sum that weighs every output."""
+        """Return a function that computes the gradients of a weighted sum of all outputs, and the outputs."""
 
         def total(params, hidden):
             outputs = network.apply(params, hidden, case.obs, case.reset)
@@ -146,8 +146,8 @@ def test_outputs_and_gradients_equal_the_plain_form(which, request):
     assert_close(to_hidden, plain_to_hidden)
 
 
-def test_initial_weights(small):
-    """Initial weights are orthogonal with the published scales, and biases are zero."""
+def test_initial_weights_have_the_published_scales(small):
+    """Initial kernels are orthogonal with the published scales, and initial biases are zero."""
     init = jax.jit(small.network.init)
     params = init(jax.random.key(0), small.hidden, small.obs, small.reset)
     tree = plain_names(params, small.network.widths)["params"]

@@ -1,4 +1,4 @@
-"""One update of a population: what each policy learns from, the changes of the state, the metrics."""
+"""One update of a population: training data of each policy, changes of the state, and metrics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from icrl4aht_generation.learners.population.population import Algorithm, Popula
 from icrl4aht_generation.learners.ppo import sequences, shaping_weight
 from icrl4aht_generation.learners.rollout import Rollout, RolloutCarry, roll_out
 
-from tests.helpers.populations import CONFIG, plain_adapt, population
+from tests.helpers.populations import CONFIG, paper_adapt, population
 from tests.helpers.trees import same_bytes
 
 
@@ -26,24 +26,21 @@ def part(tree: Any, number: int) -> Any:
 
 @pytest.fixture(scope="module")
 def learn(lbrdiv):
-    """Return the compiled update of one policy."""
+    """Return the compiled PPO update of a single policy."""
     return jax.jit(lbrdiv.population.ppo.learn)
 
 
-# Complete updates.
-
-
 class Updated(NamedTuple):
-    """An update of a population.
+    """An update of a population, with the states before and after.
 
     Attributes:
-        population: the population.
-        update: compiled; maps a state to the next state, the metrics, and both results of the roll-out.
-        before: the state before the update.
-        after: the state after it.
-        metrics: its metrics.
-        carry: environments and memories after its roll-out.
-        rollout: its roll-out.
+        population: the updated population.
+        update: compiled function from a state to the next state, the metrics, and the carry and steps of the roll-out.
+        before: state before the update.
+        after: state after the update.
+        metrics: metrics of the update.
+        carry: environments and memories after the update's roll-out.
+        rollout: steps of the update's roll-out.
     """
 
     population: Population
@@ -55,10 +52,10 @@ class Updated(NamedTuple):
     rollout: Rollout
 
 
-def updated(algorithm: Algorithm, learning: bool = True) -> Updated:
-    """Return the second update, in which the warm-up of the learning rate is over.
+def second_update(algorithm: Algorithm, learning: bool = True) -> Updated:
+    """Return the second update of a population, in which the learning rate's warm-up is over.
 
-    Without `learning` the policies stay as they are, which compiles in a third of the time.
+    Without `learning`, policies do not change, so the update compiles in a third of the time.
     """
     trained = population(algorithm)
 
@@ -83,18 +80,18 @@ def updated(algorithm: Algorithm, learning: bool = True) -> Updated:
 
 @pytest.fixture(scope="module")
 def comedi() -> Updated:
-    return updated(CoMeDi())
+    return second_update(CoMeDi())
 
 
 @pytest.fixture(scope="module")
 def comedi_play() -> Updated:
-    """Return an update of CoMeDi without learning."""
-    return updated(CoMeDi(), learning=False)
+    """Return an update of CoMeDi in which no policy changes."""
+    return second_update(CoMeDi(), learning=False)
 
 
 @pytest.fixture(scope="module")
 def lbrdiv() -> Updated:
-    return updated(LBRDiv(2))
+    return second_update(LBRDiv(2))
 
 
 @pytest.fixture(params=[pytest.param("comedi", marks=pytest.mark.slow), "lbrdiv"])
@@ -102,7 +99,7 @@ def either(request) -> Updated:
     return request.getfixturevalue(request.param)
 
 
-def test_an_update_is_a_pure_function_of_the_state(either):
+def test_population_update_depends_only_on_the_state(either):
     assert same_bytes(either.update(either.before)[0], either.after)
     other = either.update(either.before._replace(key=jax.random.key(77)))[0]
     assert not same_bytes(other.params, either.after.params)
@@ -110,14 +107,14 @@ def test_an_update_is_a_pure_function_of_the_state(either):
     assert not same_bytes(later.params, either.after.params)
 
 
-def test_all_learning_policies_change_and_no_other(either):
+def test_population_update_changes_learning_policies_only(either):
     learning = either.population.assignment.learning
     for number in range(either.population.assignment.policies):
         same = same_bytes(part(either.before.params, number), part(either.after.params, number))
         assert same == (number >= learning)
 
 
-def test_metrics_separate_self_play_from_cross_play(either):
+def test_metrics_separate_returns_of_self_play_and_cross_play(either):
     assignment, done = either.population.assignment, np.asarray(either.rollout.done)
     returns = np.asarray(either.rollout.returns)
     fresh, group = assignment.starts_from < 0, assignment.policy[0] % 2 == assignment.policy[1] % 2
@@ -129,8 +126,8 @@ def test_metrics_separate_self_play_from_cross_play(either):
 
 
 @pytest.mark.slow
-def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(lbrdiv, learn):
-    """Compare with one update per policy on its own slots."""
+def test_population_update_equals_separate_updates_of_each_policy(lbrdiv, learn):
+    """Compare with one separate update of each policy on the slots that it plays."""
     trained, before = lbrdiv.population, lbrdiv.before
     assignment = trained.assignment
     key = jax.random.split(jax.random.fold_in(before.key, before.update), 3)[1]
@@ -157,9 +154,9 @@ def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(l
 
 
 @pytest.mark.slow
-def test_shaped_rewards_count_only_where_a_return_is_raised(lbrdiv):
+def test_shaped_rewards_are_ignored_in_slots_with_negative_weight(lbrdiv):
     trained, before = lbrdiv.population, lbrdiv.before
-    lowered = np.asarray(trained._slot_weights(before.memory)).reshape(2, -1).T < 0  # (N, 2)
+    lowered = np.asarray(trained._slot_weights(before.memory)).reshape(2, -1).T < 0  # shape (N, 2)
     assert 0 < lowered.sum() < lowered.size
     shaped = np.random.default_rng(8).uniform(size=lbrdiv.rollout.shaped.shape).astype(np.float32)
 
@@ -173,21 +170,21 @@ def test_shaped_rewards_count_only_where_a_return_is_raised(lbrdiv):
     assert not same_bytes(params, learned(np.where(lowered, shaped, 0.0)))
 
 
-def test_the_multipliers_follow_the_returns_of_the_envs(lbrdiv):
+def test_lbrdiv_multipliers_follow_the_returns_of_the_environments(lbrdiv):
     assignment, returns = lbrdiv.population.assignment, np.asarray(lbrdiv.rollout.returns)[-1]
     env = np.full((4, 4), np.nan)
     seen = np.zeros((4, 4), bool)
     for left, right in product((2, 3), (0, 1)):
         env[left, right] = returns[(assignment.policy[0] == left) & (assignment.policy[1] == right)].mean()
         seen[left, right] = True
-    expected = plain_adapt(lbrdiv.before.memory, env, seen, 0.1, 0.01)
+    expected = paper_adapt(lbrdiv.before.memory, env, seen, 0.1, 0.01)
     for name, one, other in zip(Multipliers._fields, lbrdiv.after.memory, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
 @pytest.mark.slow
-def test_episodes_from_mixed_play_start_where_mixed_play_had_been(comedi_play):
-    """A quarter of the envs starts from states that the third quarter went through in the roll-out before."""
+def test_comedi_starts_some_episodes_in_states_of_mixed_play(comedi_play):
+    """The last quarter of environments starts from states that the third quarter visited in the previous roll-out."""
     source = comedi_play.population.assignment.starts_from
     started = np.asarray(comedi_play.after.carry.env.record)
     visited = np.asarray(comedi_play.before.visited)

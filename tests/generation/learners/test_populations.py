@@ -1,6 +1,6 @@
-"""Assignments of policies to agent slots in each algorithm, weights of the slots, and LBRDiv's multipliers.
+"""The population algorithms: which policies play which agent slots, weights of slots, and LBRDiv's multipliers.
 
-The expected values follow the formulas of the paper's App. B.1, written out by hand.
+Expected values are computed by the formulas of the paper's App. B.1.
 """
 
 from __future__ import annotations
@@ -17,12 +17,10 @@ from icrl4aht_generation.learners.population.fcp import FCP
 from icrl4aht_generation.learners.population.lbrdiv import LBRDiv, Multipliers
 
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
-from tests.helpers.populations import plain_adapt, population
-
-# Assignments.
+from tests.helpers.populations import paper_adapt, population
 
 
-def test_fcp_members_play_themselves_as_either_agent():
+def test_fcp_members_play_both_agents_with_themselves():
     assignment = FCP(3).assignment(4)
     np.testing.assert_array_equal(assignment.policy, [[0] * 4 + [1] * 4 + [2] * 4] * 2)
     np.testing.assert_array_equal(assignment.term, assignment.policy)
@@ -38,7 +36,7 @@ def test_fcp_members_play_themselves_as_either_agent():
 
 @pytest.mark.parametrize("algorithm", [BRDiv, LBRDiv])
 @pytest.mark.parametrize(("members", "environments"), [(1, 4), (2, 8), (3, 8), (10, 256)])
-def test_confederates_are_teammates_and_best_responses_egos(algorithm, members, environments):
+def test_confederates_play_teammates_and_best_responses_play_egos(algorithm, members, environments):
     assignment = algorithm(members).assignment(environments)
     responses, confederates = assignment.policy
     assert set(responses) == set(range(members, 2 * members))
@@ -56,7 +54,7 @@ def test_confederates_are_teammates_and_best_responses_egos(algorithm, members, 
 
 
 @pytest.mark.parametrize(("members", "environments"), [(2, 8), (3, 8), (4, 24), (10, 256)])
-def test_three_quarters_of_the_envs_are_self_play_and_every_pair_plays(members, environments):
+def test_brdiv_uses_three_quarters_self_play_and_every_other_pair(members, environments):
     responses, confederates = BRDiv(members).assignment(environments).policy
     pairs = np.zeros((members, members), int)
     np.add.at(pairs, (confederates, responses - members), 1)
@@ -68,7 +66,7 @@ def test_three_quarters_of_the_envs_are_self_play_and_every_pair_plays(members, 
 
 
 @pytest.mark.parametrize("environments", [8, 16, 256])
-def test_comedi_has_a_quarter_each_of_self_play_cross_play_mixed_play_and_its_states(environments):
+def test_comedi_divides_environments_into_four_equal_kinds_of_play(environments):
     assignment = CoMeDi().assignment(environments)
     quarter = environments // 4
     play, cross, mixed, from_mixed = np.split(assignment.policy, 4, axis=1)
@@ -93,13 +91,13 @@ def test_comedi_has_a_quarter_each_of_self_play_cross_play_mixed_play_and_its_st
     assert assignment.agent_slots(0)[1].size + assignment.agent_slots(1)[1].size == 2 * quarter + quarter + quarter // 2
 
 
-def test_comedi_needs_a_multiple_of_eight_environments():
+def test_comedi_rejects_environments_that_are_not_a_multiple_of_eight():
     with pytest.raises(ValueError, match="environments = 12: CoMeDi needs a multiple of 8"):
         CoMeDi().assignment(12)
 
 
 @pytest.mark.parametrize("algorithm", [FCP(3), BRDiv(3), LBRDiv(4), CoMeDi()])
-def test_groups_hold_every_slot_once_and_counting_slots_first(algorithm):
+def test_groups_of_policies_contain_every_slot_once(algorithm):
     trained = population(algorithm)
     assignment = trained.assignment
     everyone = np.concatenate([group.agent_slots.ravel() for group in trained.groups])
@@ -113,20 +111,17 @@ def test_groups_hold_every_slot_once_and_counting_slots_first(algorithm):
             assert group.counting == counting.size
 
 
-def test_critics_see_the_partner_where_partners_vary():
+def test_critics_receive_the_partner_if_partners_vary():
     partners = {type(a): population(a).network.partners for a in (FCP(3), BRDiv(1), BRDiv(3), LBRDiv(2), CoMeDi())}
     assert partners == {FCP: 0, BRDiv: 6, LBRDiv: 4, CoMeDi: 2}
     assert population(BRDiv(1)).network.partners == 0
     assert population(FCP(1), partners=2).network.partners == 2
 
 
-# Weights of the slots.
+def weights_by_paper(algorithm: Any, memory: Any) -> np.ndarray:
+    """Return float64 (2, N), the weight of each slot's return in the policy's objective by the paper's equations.
 
-
-def by_hand(algorithm: Any, memory: Any) -> np.ndarray:
-    """Return the weight of each slot's return in its policy's objective, from the paper's equations, float64 (2, N).
-
-    An expected return is the mean over its slots.
+    An expected return in the equations is the mean over the slots of a pair of policies.
     """
     assignment = algorithm.assignment(16)
     k = getattr(algorithm, "members", 0)
@@ -137,7 +132,7 @@ def by_hand(algorithm: Any, memory: Any) -> np.ndarray:
         elif isinstance(algorithm, CoMeDi):
             quarter = env // 4
             alpha, beta = algorithm.cross_play_weight, algorithm.mixed_play_weight
-            mixed = beta / 2 / 4 if left == right else beta / 2 / 2  # half of J_MP over 4 slots, half over 2
+            mixed = beta / 2 / 4 if left == right else beta / 2 / 2  # J_MP: 4 slots and 2 slots
             both = {0: 1 / 8, 1: -alpha / 4, 2: 0, 3: mixed}[quarter]
             expected[:, env] = [both * (left == 0), both * (right == 0)]
         else:
@@ -173,12 +168,12 @@ def some_multipliers(members: int) -> Multipliers:
         (CoMeDi(cross_play_weight=0.3, mixed_play_weight=2.0), ()),
     ],
 )
-def test_slot_weights_are_the_papers(algorithm, memory):
-    """Up to a positive factor for each policy, which makes the mean size of a policy's weights 1."""
+def test_slot_weights_follow_the_equations_of_the_paper(algorithm, memory):
+    """Weights agree up to a factor for each policy, which makes the mean absolute weight of a policy 1."""
     trained = population(algorithm)
     found = np.asarray(trained._slot_weights(memory))
     expected, policy, counts = (
-        by_hand(algorithm, memory).ravel(),
+        weights_by_paper(algorithm, memory).ravel(),
         trained.assignment.policy.ravel(),
         trained.assignment.term >= 0,
     )
@@ -189,21 +184,18 @@ def test_slot_weights_are_the_papers(algorithm, memory):
         np.testing.assert_allclose(found[mine], expected[mine] / np.abs(expected[mine]).mean(), rtol=1e-5)
 
 
-# Multipliers.
-
-
 def random_returns(k: int, rng: np.random.Generator, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean returns of pairs, float32 (2k, 2k), NaN where `seen`, bool (2k, 2k), is False.
+    """Return mean returns of pairs, float32 (2k, 2k), and bool (2k, 2k), which pairs were seen; others are NaN.
 
-    Only pairs of a best response as the ego and a confederate as the teammate are seen.
+    Only pairs of a best response as the ego and a confederate as the teammate can be seen.
     """
     seen = np.zeros((2 * k, 2 * k), bool)
     seen[k:, :k] = rng.random((k, k)) < share
     return np.where(seen, rng.normal(size=seen.shape) * 30, np.nan).astype(np.float32), seen
 
 
-def test_multipliers_follow_the_papers_update():
-    """From the start, a few pairs seen at a time."""
+def test_lbrdiv_multipliers_follow_the_update_of_the_paper():
+    """Compare several updates from the initial multipliers, with different shares of pairs seen."""
     k, rng = 4, np.random.default_rng(12)
     algorithm = LBRDiv(k, tolerance=0.3, learning_rate=0.05)
     found, expected = algorithm.init(), algorithm.init()
@@ -211,7 +203,7 @@ def test_multipliers_follow_the_papers_update():
     for share in (0.0, 0.2, 0.5, 0.0, 0.5, 0.9, 1.0):
         returns, seen = random_returns(k, rng, share)
         found = adapt(found, returns, seen)
-        expected = plain_adapt(expected, returns, seen, 0.3, 0.05)
+        expected = paper_adapt(expected, returns, seen, 0.3, 0.05)
         for name, one, other in zip(Multipliers._fields, found, expected, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4, err_msg=name)
         for multipliers in found[:2]:

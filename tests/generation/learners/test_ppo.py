@@ -1,8 +1,8 @@
-"""PPO: advantages, replay of the recurrent state, purity, schedules, and that it learns.
+"""PPO: advantages, loss, replay of the recurrent state, schedules, and learning.
 
-One tiny learner for all tests. Its ego is in a closet between two buttons, a pile and a pot, so pressing (-5) and
-placing (+3 shaped) happen often; of every three roll-outs of 8 steps, an episode of 12 ends inside the second and one
-with the third.
+All tests use one tiny learner. Its ego stands between two buttons, a pile and a pot, so it often presses a button
+(reward -5) or fills the pot (shaped reward 3). Roll-outs have 8 steps and episodes 12, so of three roll-outs, one
+episode ends inside the second and one at the end of the third.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ UpdateFunction = Callable[[LearnerState], tuple[LearnerState, Rollout, dict[str,
 
 
 PARAMS = {"turn": np.uint32(0)}
-"""Parameters of the scripted teammate: the number of directions by which its steps are rotated."""
+"""Parameters of the scripted teammate: a number of directions by which its moves are rotated."""
 
 
 class Diary(NamedTuple):
     """Memory of the scripted teammate."""
 
-    offset: jax.Array  # from the episode's key
-    steps: jax.Array  # number of its steps in the episode
+    offset: jax.Array  # drawn by the episode's key
+    steps: jax.Array  # number of steps taken in the episode
 
 
 def begin(params, key) -> Diary:
@@ -66,7 +66,7 @@ def begin(params, key) -> Diary:
 
 
 def acts(params, memory: Diary, view, key):
-    """Take a step in a direction that depends on the memory and the observation."""
+    """Move in a direction that depends on the memory, the observation and the parameters."""
     action = (memory.offset + memory.steps + view.sum(dtype=jnp.uint32) + params["turn"]) % 4
     return action.astype(jnp.int32), memory._replace(steps=memory.steps + 1)
 
@@ -88,22 +88,22 @@ def untrained(learner) -> LearnerState:
 
 @pytest.fixture(scope="module")
 def frozen(untrained) -> LearnerState:
-    """A state at the end of the learning-rate schedule, where nothing is learned any more; its logits and values are
-    wide apart and depend on the hidden state."""
+    """Return a state at the end of the learning-rate schedule, where updates change no parameters. Random parameters
+    make logits and values vary with the hidden state."""
     rng = np.random.default_rng(0)
     params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.3, untrained.params)
     steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
-    return untrained._replace(params=params, optimizer=counted(untrained.optimizer, steps))
+    return untrained._replace(params=params, optimizer=set_counters(untrained.optimizer, steps))
 
 
-def counted(optimizer: Any, steps: int) -> Any:
-    """Return the optimizer's state, its counters set."""
+def set_counters(optimizer: Any, steps: int) -> Any:
+    """Set the counters in an optimizer's state to a number of steps."""
     return jax.tree.map(lambda x: jnp.full_like(x, steps) if jnp.issubdtype(x.dtype, jnp.integer) else x, optimizer)
 
 
 class Played(NamedTuple):
     before: list[LearnerState]
-    rollouts: list[Rollout]  # NumPy
+    rollouts: list[Rollout]  # as NumPy arrays
     metrics: list[dict[str, float]]
     after: LearnerState
 
@@ -120,7 +120,7 @@ def play(update: UpdateFunction, state: LearnerState, updates: int) -> Played:
 
 @pytest.fixture(scope="module")
 def played(update, frozen) -> Played:
-    """Return 40 roll-outs of one policy."""
+    """Return 40 updates from the state `frozen`, with roll-outs of the same policy."""
     return play(update, frozen, 40)
 
 
@@ -129,23 +129,20 @@ def trained(update, untrained) -> Played:
     return play(update, untrained, CONFIG.updates)
 
 
-def egos(rollout: Rollout) -> Choice:
-    """Return the ego's actions, log-probabilities and values."""
+def ego_choices(rollout: Rollout) -> Choice:
+    """Return the ego's actions, log-probabilities and values in a roll-out."""
     return rollout.choices[EGO]
 
 
-def egos_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
-    """Return the sequences that the ego learns from in the roll-out from this state."""
+def ego_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
+    """Return the training sequences of the ego in the roll-out that starts in the given state."""
     slots, hidden = np.arange(CONFIG.environments), state.carry.memories[EGO]
     view = CompactView("paper", (CLOSET,))
     return sequences(view, rollout, EGO, slots, hidden, jnp.zeros(slots.size), jnp.float32(0))
 
 
-# Advantages.
-
-
 def plain_advantage(reward, value, done, last_value, gamma: float, lam: float) -> np.ndarray:
-    """Return GAE by a loop over environments and steps."""
+    """Return generalised advantage estimates by a loop over environments and steps."""
     out = np.zeros(reward.shape)
     for n in range(reward.shape[1]):
         trace, following = 0.0, last_value[n]
@@ -159,7 +156,7 @@ def plain_advantage(reward, value, done, last_value, gamma: float, lam: float) -
 
 
 @pytest.mark.parametrize(("gamma", "lam"), [(0.99, 0.95), (0.9, 0.0), (0.5, 1.0)])
-def test_generalised_advantage(gamma, lam):
+def test_generalised_advantage_equals_a_loop_over_steps(gamma, lam):
     rng = np.random.default_rng(2)
     reward, value = rng.normal(size=(2, 20, 6)).astype(np.float32)
     done = rng.random((20, 6)) < 0.15
@@ -172,41 +169,38 @@ def test_generalised_advantage(gamma, lam):
     np.testing.assert_allclose(found, plain_advantage(reward, value, done, last, gamma, lam), rtol=0, atol=1e-5)
 
 
-# Replay.
-
-
 def replay(learner: Learner, state: LearnerState, rollout: Rollout, reset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return log-probabilities and values of the network on the sequences that the ego learns from."""
-    own = egos_sequences(state, rollout)
+    """Return the network's log-probabilities and values on the ego's training sequences."""
+    own = ego_sequences(state, rollout)
     output: Any = jax.jit(learner.network.apply)(state.params, own.hidden[0], own.seen, reset)
     log_probs = np.asarray(jax.nn.log_softmax(output[1]))
     return np.take_along_axis(log_probs, np.asarray(own.action)[..., None], axis=-1)[..., 0], np.asarray(output[2])
 
 
-def test_sequences_replay_the_rollout_across_an_episode_end(learner, played):
-    """The second roll-out: it starts within an episode, with a hidden state, and the next episode starts at step 4."""
+def test_training_sequences_replay_a_roll_out_across_episodes(learner, played):
+    """The second roll-out starts inside an episode with a nonzero hidden state; the next episode starts at step 4."""
     state, rollout = played.before[1], played.rollouts[1]
     np.testing.assert_array_equal(rollout.reset.nonzero()[0], [4] * 4)
     np.testing.assert_array_equal(rollout.done.nonzero()[0], [3] * 4)
     assert np.abs(state.carry.memories[EGO]).min() > 0
     log_prob, value = replay(learner, state, rollout, rollout.reset)
-    np.testing.assert_allclose(log_prob, egos(rollout).log_prob, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(value, egos(rollout).value, rtol=0, atol=1e-4)
-    # The same from dones that are not shifted: wrong from the step of the end on.
+    np.testing.assert_allclose(log_prob, ego_choices(rollout).log_prob, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(value, ego_choices(rollout).value, rtol=0, atol=1e-4)
+    # With resets at the last step of an episode instead of the first step, values are wrong from this step on.
     _, value = replay(learner, state, rollout, rollout.done)
-    wrong = np.abs(value - egos(rollout).value).max(axis=1)
+    wrong = np.abs(value - ego_choices(rollout).value).max(axis=1)
     assert wrong[:3].max() < 1e-4 < 1e-2 < wrong[3:].min()
 
 
-def test_loss_against_plain_numpy(learner, played):
-    """At moved parameters, where ratios and value changes are clipped, from hand-written formulas."""
+def test_ppo_loss_equals_formulas_in_numpy(learner, played):
+    """Compare the loss with formulas in NumPy, at changed parameters with clipped ratios and values."""
     rollout = played.rollouts[1]
     rng = np.random.default_rng(6)
     params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.1, played.before[1].params)
     hidden = played.before[1].carry.memories[EGO]
     advantage, target = rng.normal(size=(2, *rollout.done.shape)).astype(np.float32)
-    weight = np.array([1.0, -1.0, 0.5, -2.0], np.float32)  # populations lower the returns of negative weights
-    own = egos_sequences(played.before[1], rollout)._replace(weight=weight[None])
+    weight = np.array([1.0, -1.0, 0.5, -2.0], np.float32)  # negative weights lower returns
+    own = ego_sequences(played.before[1], rollout)._replace(weight=weight[None])
     batch = jax.tree.map(jnp.asarray, Batch(own, advantage, target))
     total, parts = jax.jit(learner.ppo.loss)(params, batch)
 
@@ -215,12 +209,12 @@ def test_loss_against_plain_numpy(learner, played):
     logits, value = np.asarray(output[1], np.float64), np.asarray(output[2], np.float64)
     log_probs = logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))
     chosen = np.take_along_axis(log_probs, rollout.actions[..., EGO, None], axis=-1)[..., 0]
-    ratio = np.exp(chosen - egos(rollout).log_prob)
-    change = value - egos(rollout).value
+    ratio = np.exp(chosen - ego_choices(rollout).log_prob)
+    change = value - ego_choices(rollout).value
     assert (np.abs(ratio - 1) > CONFIG.clip).any() and (np.abs(change) > CONFIG.clip).any()
     normalised = (advantage - advantage.mean()) / advantage.std() * weight
     policy = -np.minimum(ratio * normalised, np.clip(ratio, 0.8, 1.2) * normalised).mean()
-    near = egos(rollout).value + np.clip(change, -0.2, 0.2)
+    near = ego_choices(rollout).value + np.clip(change, -0.2, 0.2)
     value_loss = 0.5 * np.maximum((value - target) ** 2, (near - target) ** 2).mean()
     entropy = -(np.exp(log_probs) * log_probs).sum(axis=-1).mean()
     expected = {"policy_loss": policy, "value_loss": value_loss, "entropy": entropy}
@@ -230,10 +224,7 @@ def test_loss_against_plain_numpy(learner, played):
     np.testing.assert_allclose(total, policy + 0.5 * value_loss - 0.01 * entropy, rtol=1e-4, atol=1e-5)
 
 
-# Purity.
-
-
-def test_update_is_a_pure_function(update, played):
+def test_ppo_update_depends_only_on_the_state(update, played):
     state = played.before[3]
     once, again = update(state), update(state)
     assert same_bytes(once, again)
@@ -242,28 +233,22 @@ def test_update_is_a_pure_function(update, played):
     assert not same_bytes(other_state.carry.memories[EGO], once[0].carry.memories[EGO])
 
 
-# Episodes.
-
-
-def test_the_teammates_parameters_are_in_the_state(update, frozen, played):
-    """One compiled update serves every teammate of a family."""
+def test_teammate_acts_by_the_parameters_in_the_state(update, frozen, played):
+    """The same compiled update can train with every teammate of a family."""
     state, rollout, _ = update(frozen._replace(teammate={"turn": jnp.uint32(1)}))
     first = played.rollouts[0].actions[0, :, TEAMMATE]
     np.testing.assert_array_equal(rollout.actions[0, :, TEAMMATE], (first + 1) % 4)
     assert int(state.teammate["turn"]) == 1
 
 
-# Schedules.
-
-
 def test_shaping_weight_falls_linearly_to_zero(played):
     found = [metrics["shaping"] for metrics in played.metrics]
-    expected = [1 - n / 30 if n < 30 else 0 for n in range(len(found))]  # 32 of 960 steps an update
+    expected = [1 - n / 30 if n < 30 else 0 for n in range(len(found))]  # an update has 32 steps
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
-def test_learning_rate_schedule():
-    """Read from the optimizer: under a constant gradient g, Adam moves by rate * g / (g + eps)."""
+def test_learning_rate_rises_linearly_then_falls_by_a_cosine():
+    """The rate is measured by Adam's steps: with a constant gradient g, a step is rate * g / (g + eps)."""
     steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
     warm = steps // 10
     gradient = jnp.float32(1e-3)
@@ -283,37 +268,28 @@ def test_learning_rate_schedule():
     assert rates[-1] == 0
 
 
-# Configuration.
-
-
 @pytest.mark.parametrize("steps", [1, 100, 101, 400, 500, 501, 899, 901, 58_368])
-def test_episodes_are_those_with_a_hundred_steps_and_the_state_after_them(steps):
-    """The records of `steps` steps hold what is kept of an episode if they reach its step 100."""
+def test_number_of_complete_episodes_follows_from_total_steps(steps):
+    """An episode counts if its first 100 steps and the state after them are recorded."""
     complete = sum(start + 100 < steps for start in range(0, steps, 400))
     assert PPOConfig(total_steps=steps, environments=1, rollout=1, minibatches=1).episodes == complete
 
 
-# Learning.
-
-
-def test_the_ego_learns_not_to_press(trained):
-    """A press costs 5, and a random ego presses about once an episode."""
+def test_ego_learns_not_to_press_buttons(trained):
+    """Pressing a button costs 5, and a random ego presses a button about once in each episode."""
     early = np.mean([rollout.reward.mean() for rollout in trained.rollouts[:5]])
     late = np.mean([rollout.reward.mean() for rollout in trained.rollouts[-20:]])
     assert early < -0.1
     assert late > 0.2 * early
 
 
-# Rewards.
-
-
 REWARDS = np.array([-20, -25, -30, -10, -5, 0, 20, 15], np.float32)
-"""A wrong delivery, one with one press of a button and with two, presses alone, nothing, a delivery without and with a
-press."""
+"""Rewards of a step: a wrong delivery with 0, 1 and 2 presses of a button; 2 presses and 1 press; nothing; a correct
+delivery with 0 and 1 press."""
 
 
-def rewarded() -> Rollout:
-    """Return steps of two environments with these rewards; agent a has the shaped reward a + 1 in every step."""
+def rewarded_rollout() -> Rollout:
+    """Return a roll-out of two environments with `REWARDS`; agent a has the shaped reward a + 1 in every step."""
     size = (len(REWARDS), 2)
     zeros, choices = jnp.zeros(size), jnp.zeros((len(REWARDS), 4))
     return Rollout(
@@ -328,14 +304,14 @@ def rewarded() -> Rollout:
     )
 
 
-def test_a_wrong_delivery_is_forgiven_as_long_as_rewards_are_shaped():
-    """A wrong delivery is forgiven for both agents, with or without button presses; presses alone are not."""
-    slots = np.arange(4)  # both agents of both environments
+def test_forgiveness_offsets_wrong_deliveries_while_rewards_are_shaped():
+    """With forgiveness, shaping offsets the penalty of wrong deliveries for both agents, but not of button presses."""
+    slots = np.arange(4)  # both agents in both environments
     agents = np.repeat([EGO, TEAMMATE], 2)
     for weight, forgiven in ((1.0, 20), (0.25, 5), (0.0, 0)):
         found = sequences(
             lambda records: records,  # type: ignore[arg-type]
-            rewarded(),
+            rewarded_rollout(),
             0,
             slots,
             jnp.zeros((4, 8)),

@@ -1,4 +1,4 @@
-"""Saved states, logs and locks of trainings."""
+"""Saved states, logs and folder locks of trainings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SETTINGS = {"ego": {"rate": 0.1, "layers": (1, 2)}, "seed": 3}
 
 
 def state() -> State:
-    """Return a pytree with every kind of leaf and node that a training's state may have."""
+    """Return a pytree with every kind of leaf and node that the state of a training can have."""
     params = {"kernel": jnp.arange(6.0).reshape(2, 3).T, "empty": jnp.zeros((0, 4)), "nothing": ()}
     keys = {"one": jax.random.key(5), "many": jax.random.split(jax.random.key(3), 4)}
     record, ended = jnp.arange(256, dtype=jnp.uint8), jnp.array([True, False])
@@ -71,7 +71,7 @@ def file(tmp_path) -> StateFile:
         ({"PJRT_NPROC": "many"}, len(os.sched_getaffinity(0))),
     ],
 )
-def test_xlas_threads(monkeypatch, variables, threads):
+def test_number_of_xla_threads_follows_environment_variables(monkeypatch, variables, threads):
     for name in ("NPROC", "PJRT_NPROC"):
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
@@ -80,7 +80,7 @@ def test_xlas_threads(monkeypatch, variables, threads):
     assert software_versions()["xla_threads"] == threads
 
 
-def test_threads_cannot_change_after_jax_was_used(monkeypatch):
+def test_changing_xla_threads_after_jax_was_used_raises_error(monkeypatch):
     jax.devices()
     monkeypatch.setenv("PJRT_NPROC", "3")
     limit_xla_threads(3)
@@ -90,8 +90,8 @@ def test_threads_cannot_change_after_jax_was_used(monkeypatch):
 
 
 @pytest.mark.slow
-def test_threads_are_limited_before_jax_is_used():
-    """The number of XLA's threads among those of the process grows with the limit."""
+def test_xla_threads_are_limited_if_jax_was_not_used_yet():
+    """The number of threads that XLA starts equals the limit, as the process's list of threads shows."""
     script = (
         "import os, jax; from icrl4aht_generation.learners.resume import limit_xla_threads, xla_threads\n"
         "limit_xla_threads({0}); jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((500, 500))))\n"
@@ -103,14 +103,14 @@ def test_threads_are_limited_before_jax_is_used():
 
 
 class TestStateFile:
-    def test_another_number_of_threads_is_refused(self, file, monkeypatch):
+    def test_state_of_another_number_of_threads_raises_error(self, file, monkeypatch):
         StateFile(file.path, SETTINGS | software_versions()).save({}, 1)
         monkeypatch.setenv("PJRT_NPROC", "17")
         again = StateFile(file.path, SETTINGS | software_versions())
         with pytest.raises(OtherSettingsError, match=r"xla_threads was (\d+), now it is \d+; set PJRT_NPROC=\1 "):
             again.load({})
 
-    def test_round_trip(self, file):
+    def test_saved_state_is_loaded_exactly(self, file):
         assert file.progress is None
         saved = state()
         file.save(saved, 7)
@@ -120,7 +120,7 @@ class TestStateFile:
         assert [path.name for path in file.path.parent.iterdir()] == ["s.safetensors"]
 
     def test_equal_states_give_equal_bytes(self, file):
-        """Files do not depend on the library's random order of metadata."""
+        """Files do not depend on the random order in which safetensors writes metadata."""
         contents = set()
         for _ in range(8):
             file.save(state(), 7)
@@ -128,7 +128,7 @@ class TestStateFile:
         assert len(contents) == 1
         assert int.from_bytes(contents.pop()[:8], "little") % 8 == 0
 
-    def test_one_part_alone_and_given_shardings(self, file):
+    def test_state_can_be_loaded_in_part_and_with_given_shardings(self, file):
         saved = state()
         file.save(saved, 7)
         shapes = jax.eval_shape(lambda: saved.params)
@@ -142,7 +142,7 @@ class TestStateFile:
         assert_equal(found, saved)
         assert all(leaf.sharding == device for leaf in jax.tree.leaves(found))
 
-    def test_an_interrupted_save_keeps_the_previous_one(self, file, monkeypatch):
+    def test_interrupted_save_keeps_the_previous_state(self, file, monkeypatch):
         file.save(state(), 1)
 
         def cut(path, content):
@@ -163,19 +163,19 @@ class TestStateFile:
             ({}, r"count: expected nothing, found int32 \(\)"),
         ],
     )
-    def test_other_arrays_are_named(self, file, like, message):
+    def test_state_with_unexpected_arrays_raises_error_with_their_names(self, file, like, message):
         file.save({"count": jnp.int32(7)}, 1)
         with pytest.raises(OptionError, match=rf"s\.safetensors: not a state of this training: {message}; remove"):
             file.load(like)
 
-    def test_other_settings_are_named(self, file):
+    def test_state_of_other_settings_raises_error_with_the_difference(self, file):
         file.save({}, 1)
         other = StateFile(file.path, {"ego": {"rate": 0.2, "layers": [1, 2]}, "seed": 3})
         with pytest.raises(OtherSettingsError, match=r"s\.safetensors: .*ego\.rate was 0\.1, now it is 0\.2"):
             other.load({})
         assert StateFile(file.path).progress == 1
 
-    def test_a_damaged_or_missing_file_is_named(self, file):
+    def test_damaged_or_missing_state_file_raises_error_with_its_name(self, file):
         with pytest.raises(OptionError, match=r"s\.safetensors: .*no such file"):
             file.load({})
         file.path.write_bytes(b"not a state")
@@ -183,12 +183,12 @@ class TestStateFile:
             with pytest.raises(OptionError, match=r"s\.safetensors: not a state of this training: .*remove the file"):
                 read()
 
-    def test_two_leaves_of_one_path_are_refused(self, file):
+    def test_saving_two_leaves_with_the_same_path_raises_error(self, file):
         with pytest.raises(ValueError, match="same path"):
             file.save({"a/b": jnp.int32(0), "a": {"b": jnp.int32(1)}}, 1)
 
 
-def test_checkpoints_keep_the_latest(tmp_path):
+def test_only_the_latest_checkpoints_are_kept(tmp_path):
     checkpoints = Checkpoints(tmp_path / "checkpoints", SETTINGS, keep=2)
     assert checkpoints.latest is None
     with pytest.raises(OptionError, match="no checkpoint yet"):
@@ -202,7 +202,7 @@ def test_checkpoints_keep_the_latest(tmp_path):
     assert int(checkpoints.at(10).load(like)["step"]) == 10
 
 
-def test_the_log_is_cut_after_what_was_saved(tmp_path):
+def test_resumed_log_drops_lines_after_the_saved_state(tmp_path):
     with closing(RunLog(tmp_path, lambda line: False)) as log:
         for update in range(4):
             log.write({"update": update}, {"update": update, "part": "b"}, timing={"update": update})
@@ -216,7 +216,7 @@ def test_the_log_is_cut_after_what_was_saved(tmp_path):
     assert [json.loads(line)["update"] for line in timing] == [0, 1]
 
 
-def test_when_to_save(monkeypatch):
+def test_states_are_saved_after_seconds_or_updates_and_at_the_end(monkeypatch):
     clock = iter([0.0, 1.0, 2.0, 4.0, 4.5, 5.0])
     monkeypatch.setattr(resume.time, "monotonic", lambda: next(clock))
     interval = SaveInterval(5, seconds=2.0)
@@ -226,16 +226,16 @@ def test_when_to_save(monkeypatch):
     assert [update for update in range(1, 8) if interval.due(update)] == [3, 6, 7]
 
 
-def test_a_folder_is_locked_by_one_process(tmp_path):
+def test_locked_run_folder_raises_error_for_a_second_user(tmp_path):
     with run_lock(tmp_path / "run"):
         with pytest.raises(BusyError, match="run: another process works in this folder"), run_lock(tmp_path / "run"):
             pass
         assert not (tmp_path / "run").exists()
     with run_lock(tmp_path / "run"):
         pass
-    assert not list(tmp_path.iterdir()), "the lock's file is removed"
+    assert not list(tmp_path.iterdir()), "expected the lock's file to be removed"
 
 
-def test_settings_that_differ():
+def test_differing_settings_returns_old_and_new_values():
     assert not differing_settings({"a": (1, 2)}, {"a": [1, 2]})
     assert differing_settings({"a": {"b": 1}, "c": 2}, {"a": {"b": 3}}) == {"a.b": (1, 3), "c": (2, None)}

@@ -1,7 +1,7 @@
-"""Roll-outs: agent slots, observations of each actor, memories that restart with the episodes, the restart hook.
+"""Roll-outs: agent slots, observations of each player, memories that restart with each episode, and a restart hook.
 
-Four environments have episodes of five steps. Two scripted players share the eight slots in no order; each remembers
-the record at the start of the episode and the steps since.
+Four environments have episodes of five steps. Two scripted players share the eight slots in mixed order; each
+remembers the state record at the start of the episode and the number of steps since.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LAYOUT = get_layout("cramped_up")
 ENVS, EPISODE, STEPS = 4, 5, 8
 ENV = Environment(LAYOUT, max_steps=EPISODE)
 SLOTS = np.array([5, 0, 3, 6]), np.array([2, 7, 4, 1])
-"""Agent slots of the two scripted players: environment 1 has the second player twice, 2 and 3 one of each."""
+"""Agent slots of the two scripted players: in some environments both agents have the same player."""
 
 NETWORK = ActorCritic(Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=8), partners=3)
 
@@ -45,12 +45,12 @@ NETWORK = ActorCritic(Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=
 class Notes(NamedTuple):
     """Memory of a scripted player with M slots."""
 
-    begun: jax.Array  # (M, S), the record that it began with
-    steps: jax.Array  # (M,)
+    begun: jax.Array  # (M, S), state record at the start of the episode
+    steps: jax.Array  # (M,), number of steps in the episode
 
 
 def scripted(slots: np.ndarray) -> Player:
-    """Return a player that acts by its slot, the steps of the episode and the record at its start."""
+    """Return a player that acts by its slot, the steps of the episode and the record at the episode's start."""
 
     def begin(state: EnvState) -> Notes:
         return Notes(state.record[slots % ENVS], jnp.zeros(slots.size, jnp.int32))
@@ -64,23 +64,23 @@ def scripted(slots: np.ndarray) -> Player:
 
 
 def expected_actions(record: np.ndarray) -> np.ndarray:
-    """Return the actions of the scripted players, int (T, N, 2), in a roll-out that starts with the episodes."""
+    """Return the actions int (T, N, 2) of the scripted players in a roll-out that starts with new episodes."""
     slot = np.arange(2 * ENVS).reshape(2, ENVS).T
     step = np.arange(len(record))
     begun = record[step - step % EPISODE].sum(axis=-1, dtype=np.int64)
     return (slot + 2 * (step % EPISODE)[:, None, None] + begun[..., None]) % len(ACTIONS)
 
 
-def marked(state: EnvState, done: jax.Array) -> EnvState:
-    """Swap the agents' positions where an episode starts: a restart hook."""
+def swap_positions(state: EnvState, done: jax.Array) -> EnvState:
+    """Swap the agents' positions in environments that start an episode; this is a restart hook."""
     first = state.record.at[:, :2].set(state.record[:, 1::-1])
     return state._replace(record=jnp.where(done[:, None], first, state.record))
 
 
 class Played(NamedTuple):
     start: RolloutCarry
-    carry: RolloutCarry  # after the last step
-    rollout: Rollout  # of both roll-outs
+    carry: RolloutCarry  # state after the last step
+    rollout: Rollout  # steps of both roll-outs
 
 
 PLAYERS = [scripted(slots) for slots in SLOTS]
@@ -88,7 +88,7 @@ scripted_rollout = jax.jit(lambda carry, key: roll_out(ENV, PLAYERS, carry, STEP
 
 
 def play(run: Any) -> Played:
-    """Return two roll-outs, one after the other, as one; NumPy."""
+    """Return two successive roll-outs joined into one, as NumPy arrays."""
     start = init_rollout(ENV, PLAYERS, jax.random.split(jax.random.key(0), ENVS))
     middle, one = run(start, jax.random.key(1))
     carry, other = run(middle, jax.random.key(2))
@@ -102,12 +102,12 @@ def played() -> Played:
 
 @pytest.fixture(scope="module")
 def restarted() -> Played:
-    return play(jax.jit(lambda carry, key: roll_out(ENV, PLAYERS, carry, STEPS, key, marked)))
+    return play(jax.jit(lambda carry, key: roll_out(ENV, PLAYERS, carry, STEPS, key, swap_positions)))
 
 
 @pytest.fixture(scope="module")
 def params() -> Any:
-    """Return parameters of three policies, leaves (3, ...), whose action probabilities are far from uniform."""
+    """Return random parameters of three policies, leaves (3, ...), with action probabilities far from uniform."""
     shapes = jax.eval_shape(lambda key: NETWORK.untrained(key, LAYOUT.channels), jax.random.key(0))
     rng = np.random.default_rng(4)
     return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=(3, *leaf.shape)), jnp.float32) * 0.4, shapes)
@@ -115,7 +115,7 @@ def params() -> Any:
 
 @pytest.fixture(scope="module")
 def apply():
-    """Return one step of the network at M slots."""
+    """Return a function that applies the network for one step in M slots."""
 
     def apply(params, hidden, obs, partner):
         outputs: Any = NETWORK.apply(params, hidden, obs[None], jnp.zeros((1, obs.shape[0]), bool), partner)
@@ -125,27 +125,24 @@ def apply():
 
 
 def in_state(record: np.ndarray) -> EnvState:
-    """Return environments in the middle of their first episode."""
+    """Return environments with the given records after the first step of their first episode."""
     clock = jnp.ones(len(record), jnp.int32)
     return EnvState(jax.random.split(jax.random.key(0), len(record)), 0 * clock, clock, jnp.asarray(record))
 
 
-def one(params: Any, policy: int) -> Any:
+def policy_params(params: Any, policy: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[policy], params)
 
 
-# Agent slots.
-
-
-def test_actions_reach_their_agents(played):
+def test_actions_of_players_reach_their_agent_slots(played):
     np.testing.assert_array_equal(played.rollout.actions, expected_actions(played.rollout.record))
     for choice, slots in zip(played.rollout.choices, SLOTS, strict=True):
         agent, env = np.divmod(slots, ENVS)
         np.testing.assert_array_equal(choice.action, played.rollout.actions[:, env, agent])
 
 
-def test_the_rollout_equals_single_environment_steps(played):
-    """Step by step through the environment itself."""
+def test_roll_out_equals_single_steps_of_the_environment(played):
+    """Compare with a loop over steps of the environment."""
     step = jax.jit(ENV.step)
     state = played.start.env
     for t, actions in enumerate(played.rollout.actions):
@@ -159,7 +156,7 @@ def test_the_rollout_equals_single_environment_steps(played):
 
 
 @pytest.mark.parametrize("batch", [(), (3,)])
-def test_slots_of_agent_1_see_what_the_teammate_observes(batch):
+def test_slot_records_show_each_agent_its_observation(batch):
     slots = np.array([7, 0, 3, 4, 5, 4])
     rng = np.random.default_rng(8)
     record = random_records(LAYOUT, 12, rng).reshape(3, ENVS, -1)[(0,) if batch == () else slice(None)]
@@ -174,11 +171,8 @@ def test_slots_of_agent_1_see_what_the_teammate_observes(batch):
     assert differ == len(slots)
 
 
-# Episodes.
-
-
-def test_memories_restart_with_each_episode(played):
-    """The value is the number of steps since the player began."""
+def test_memories_of_players_restart_with_each_episode(played):
+    """The players return the number of steps in the episode as their value."""
     clock = np.arange(2 * STEPS) % EPISODE
     for choice in played.rollout.choices:
         np.testing.assert_array_equal(choice.value, np.broadcast_to(clock[:, None], choice.value.shape))
@@ -187,8 +181,8 @@ def test_memories_restart_with_each_episode(played):
         np.testing.assert_array_equal(notes.steps, 1)
 
 
-def test_only_players_of_an_ended_episode_restart():
-    """The third environment is two steps ahead of the others."""
+def test_players_restart_only_in_environments_whose_episode_ended():
+    """The third environment starts two steps later in its episode than the others."""
     clock = np.array([0, 0, 2, 0])
     start = init_rollout(ENV, PLAYERS, jax.random.split(jax.random.key(0), ENVS))
     start = start._replace(env=start.env._replace(clock=jnp.asarray(clock)))
@@ -198,8 +192,8 @@ def test_only_players_of_an_ended_episode_restart():
         np.testing.assert_array_equal(notes.steps, (clock[slots % ENVS] + STEPS) % EPISODE)
 
 
-def test_returns_are_sums_over_the_episode_across_roll_outs(played):
-    """Rewards are synthetic, one for every step, since scripted play earns few."""
+def test_returns_add_up_rewards_of_an_episode_across_roll_outs(played):
+    """The environment's rewards are replaced by synthetic ones, since scripted play earns few rewards."""
 
     class Paying(Environment):
         def step(self, state, actions):
@@ -217,29 +211,26 @@ def test_returns_are_sums_over_the_episode_across_roll_outs(played):
     np.testing.assert_array_equal(after.returns, reward[15])
 
 
-def test_the_restart_hook_changes_first_states_and_no_others(played, restarted):
+def test_restart_hook_changes_only_first_states_of_episodes(played, restarted):
     first, rollout = played.rollout.record, restarted.rollout
-    np.testing.assert_array_equal(rollout.record[:EPISODE], first[:EPISODE])  # the hook acts only at later starts
+    np.testing.assert_array_equal(rollout.record[:EPISODE], first[:EPISODE])  # no hook at the first start
     for start in (5, 10, 15):
         swapped_positions = first[start].copy()
         swapped_positions[:, :2] = first[start, :, 1::-1]
         np.testing.assert_array_equal(rollout.record[start], swapped_positions)
 
 
-def test_players_begin_with_the_restarted_state(restarted):
+def test_players_start_with_the_state_after_the_restart_hook(restarted):
     np.testing.assert_array_equal(restarted.rollout.actions, expected_actions(restarted.rollout.record))
     for notes, slots in zip(restarted.carry.memories, SLOTS, strict=True):
         np.testing.assert_array_equal(notes.begun, restarted.rollout.record[15][slots % ENVS])
 
 
-# Policies of the network.
-
-
 @pytest.mark.parametrize("greedy", [True, False])
-def test_a_network_player_does_what_its_network_says(params, apply, greedy):
-    """In both carry, with a memory: log-probabilities, values, greedy actions and the next hidden state."""
+def test_network_player_gives_the_outputs_of_its_network(params, apply, greedy):
+    """Compare log-probabilities, values, greedy actions and next hidden states, from a nonzero hidden state."""
     slots, partner = np.array([6, 1, 3, 4]), jnp.array([2, 0, 1, 1])
-    own = one(params, 1)
+    own = policy_params(params, 1)
     player = network_player(ENV, NETWORK, own, slots, partner, greedy)
     record = random_records(LAYOUT, ENVS, np.random.default_rng(3))
     state = in_state(record)
@@ -258,7 +249,7 @@ def test_a_network_player_does_what_its_network_says(params, apply, greedy):
     np.testing.assert_allclose(after, expected, rtol=0, atol=1e-5)
 
 
-def test_several_policies_in_one_player_act_as_each_alone(params):
+def test_player_of_several_policies_equals_separate_players(params):
     slots = np.array([[6, 1], [3, 4], [0, 7]])
     partner = jnp.array([[2, 0], [1, 1], [0, 2]])
     record = random_records(LAYOUT, ENVS, np.random.default_rng(3))
@@ -268,7 +259,7 @@ def test_several_policies_in_one_player_act_as_each_alone(params):
     np.testing.assert_array_equal(together.agent_slots, slots.ravel())
     choice, after = jax.jit(together.act)(hidden, state, jax.random.key(0))
     for policy in range(3):
-        alone = network_player(ENV, NETWORK, one(params, policy), slots[policy], partner[policy], greedy=True)
+        alone = network_player(ENV, NETWORK, policy_params(params, policy), slots[policy], partner[policy], greedy=True)
         part = slice(2 * policy, 2 * policy + 2)
         own, own_after = jax.jit(alone.act)(hidden[part], state, jax.random.key(0))
         np.testing.assert_array_equal(choice.action[part], own.action)
@@ -277,11 +268,8 @@ def test_several_policies_in_one_player_act_as_each_alone(params):
         np.testing.assert_allclose(after[part], own_after, rtol=0, atol=1e-5)
 
 
-# Policies that do not learn.
-
-
-def test_each_environment_may_have_its_own_parameters():
-    """One that acts by its parameters, and one that acts by its episode's key, which no other env shares."""
+def test_policy_player_can_have_parameters_for_each_environment():
+    """The policy acts by its parameters and by the episode's key, which differs between environments."""
 
     def draws(params, key):
         return jax.random.key_data(key)[1] % 5
@@ -299,7 +287,7 @@ def test_each_environment_may_have_its_own_parameters():
         np.testing.assert_array_equal(choice.action, (action + memory) % 6)
 
 
-def test_a_policy_sees_its_own_agents_observation():
+def test_policy_player_receives_the_observation_of_its_agent():
     policy = Policy(
         {}, lambda params, key: (), lambda params, memory, view, key: (view.sum(dtype=int), ()), "observation"
     )

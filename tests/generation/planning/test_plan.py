@@ -1,4 +1,4 @@
-"""`icrl4aht-data plan`."""
+"""The command `icrl4aht-data plan`, which estimates the cost of generating a release."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from tests.helpers.tiny import NOISE, artefact
 
 @pytest.fixture
 def measured(monkeypatch) -> None:
-    """A machine that trains egos of 1,024 environments at 100,000 steps/s and populations at 50,000."""
+    """Replace measured speeds: egos train at 100,000 steps/s, and populations at 50,000 steps/s."""
     monkeypatch.setattr(plan, "step_seconds", lambda config: 1e-5 if config.environments == 1024 else 2e-5)
 
 
-def test_the_papers_numbers(measured):
-    """8 layouts x 80 teammates; populations of 10 members, each with 256 environments.
+def test_cost_of_profile_paper_matches_numbers_of_the_paper(measured):
+    """The paper has 8 layouts with 80 teammates each, from populations of 10 members with 256 environments each.
 
-    T = 146 x 100 = 14,600 (paper, App. D.1), though 228 complete updates are 58,368 steps: the 146th episode has its
-    first 100, and the state after them.
+    A history has T = 146 x 100 = 14,600 steps (paper, App. D.1): in 228 updates, or 58,368 steps, the 146th episode
+    reaches its first 100 steps and the state after them.
     """
     found = plan.estimate_cost(load_profile("paper"), devices=16)
     steps = 228 * 262_144
     assert (found["tasks"], found["environment_steps"]) == (640, 640 * steps)
     assert found["kept_transitions"] == 640 * 128 * 146 * 100
     population = 457 * 256 * 256 * 10
-    more = 457 * 256 * 256  # CoMeDi's first policy, which is no member
+    more = 457 * 256 * 256  # CoMeDi also trains a first policy, which is not a member
     assert (found["populations"], found["teammate_steps"]) == (32, 32 * population + 8 * more)
     hours, teammate_hours = (steps / 100_000 + 30) / 3600, (found["teammate_steps"] / 50_000 + 32 * 30) / 3600
     assert found["teammate_hours"] == pytest.approx(teammate_hours, abs=0.01)
@@ -42,7 +42,7 @@ def test_the_papers_numbers(measured):
     assert found["full_bytes"] == pytest.approx(9.23 * found["kept_transitions"])
 
 
-def test_noise_histories(tmp_path):
+def test_cost_of_noise_histories_needs_no_learners(tmp_path):
     (tmp_path / "noise.toml").write_text(NOISE)
     profile = load_profile(str(tmp_path / "noise.toml"))
     found = plan.estimate_cost(profile, devices=2)
@@ -58,23 +58,24 @@ def test_noise_histories(tmp_path):
     assert "learners" not in dict(plan.cost_rows(found))
 
 
-def test_stored_sizes_are_those_of_the_bundled_release():
+def test_estimated_sizes_match_the_bundled_release():
     dataset = load_icrl4aht()
     shards = sum(path.stat().st_size for path in (dataset.root / "data").rglob("*.h5"))
-    made = [entry for entry in dataset.entries if entry.source != "agent"]  # which are a thirtieth of the transitions
-    sizes = [(plan.BYTES_PER_STEP["lite", str(one.source)], plan.BYTES_PER_HISTORY.get(one.source, 0)) for one in made]
-    expected = sum(one.T * step + history for one, (step, history) in zip(made, sizes, strict=True))
+    made = [entry for entry in dataset.entries if entry.source != "agent"]  # others are few
+    expected = sum(
+        entry.T * plan.BYTES_PER_STEP["lite", str(entry.source)] + plan.BYTES_PER_HISTORY.get(str(entry.source), 0) for entry in made
+    )
     assert shards == pytest.approx(expected, rel=0.1)
 
 
-def test_disk_of_artefacts(built):
+def test_estimated_artefact_size_matches_stored_arrays(built):
     profile = load_profile(str(built / "tiny.toml"))
     arrays = sum(path.stat().st_size for path in artefact(built / "a").glob("*.npy"))
     egos = [(get_layout(name), profile.ego) for name in profile.layouts]
-    assert plan.artefact_bytes(egos) == arrays - 5 * 128  # NumPy's headers
+    assert plan.artefact_bytes(egos) == arrays - 5 * 128  # without NumPy's headers
 
 
-def test_the_command_measures_the_network(built):
+def test_plan_command_measures_speed_and_prints_costs(built):
     found = json.loads(run_cli("plan", "--profile", built / "tiny.toml", "--json"))
     assert (found["tasks"], found["devices"]) == (1, 8)
     assert 0 < found["steps_per_second"] < plan.ENVIRONMENT_STEPS_PER_SECOND

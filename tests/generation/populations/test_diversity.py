@@ -1,4 +1,4 @@
-"""Hamming distances: by hand, between families, and of policies that watch the same episodes."""
+"""Hamming distances between the actions of policies and of families on the same states."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ def count(params, key) -> jax.Array:
     return jnp.int32(0)
 
 
-def turning(params, steps, view, key):
-    """Acts by the steps it has watched and what it sees."""
+def act_by_view(params, steps, view, key):
+    """Return an action that depends on the number of steps and the observation."""
     return (params["turn"] + steps + view.sum(dtype=jnp.int32)) % 6, steps + 1
 
 
-def by_state(params, steps, view, key):
-    """Chooses an action by its parameter and the position of agent 1."""
+def act_by_state(params, steps, view, key):
+    """Return an action that depends on the parameter and the position of agent 1."""
     return (view[1].astype(jnp.int32) + params["turn"]) % 6, steps
 
 
-def policy(turn: int, act: Any = turning) -> Policy:
-    return Policy({"turn": jnp.int32(turn)}, count, act, "state" if act is by_state else "observation")
+def policy(turn: int, act: Any = act_by_view) -> Policy:
+    return Policy({"turn": jnp.int32(turn)}, count, act, "state" if act is act_by_state else "observation")
 
 
-POLICIES = [policy(0), policy(1, by_state), policy(0), policy(1)]
+POLICIES = [policy(0), policy(1, act_by_state), policy(0), policy(1)]
 
 
 @pytest.fixture(scope="module", autouse=True)
-def every_program_is_kept() -> Iterator[None]:
-    """Every call compiles small programs, so compiling is their cost."""
+def cache_all_programs() -> Iterator[None]:
+    """Cache all compiled programs, since these tests spend most time on compiling small programs."""
     least = jax.config.jax_persistent_cache_min_compile_time_secs  # type: ignore[attr-defined]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     yield
@@ -53,13 +53,13 @@ def every_program_is_kept() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def actions(every_program_is_kept) -> np.ndarray:
+def actions(cache_all_programs) -> np.ndarray:
     return actions_on_common_states(LAYOUT, POLICIES, seed=3, steps=STEPS)
 
 
 @pytest.fixture(scope="module")
-def records(every_program_is_kept) -> jax.Array:
-    """(T, episodes, S) of random agents."""
+def records(cache_all_programs) -> jax.Array:
+    """Return state records (T, episodes, S) of play by random agents."""
     env = build.Environment(LAYOUT, STEPS)
     players = [build.policy_player(env, build.REFERENCE_EGOS["random"], (), agent, 3) for agent in (0, 1)]
     carry = build.init_rollout(env, players, jax.random.split(jax.random.key(0), 3))
@@ -67,10 +67,7 @@ def records(every_program_is_kept) -> jax.Array:
     return play(carry)
 
 
-# By hand.
-
-
-def test_hamming_against_a_loop():
+def test_hamming_distances_equal_a_loop_over_states():
     actions = np.random.default_rng(0).integers(0, 6, (4, 50)).astype(np.int8)
     found = hamming_distances(actions)
     for a in range(4):
@@ -78,8 +75,8 @@ def test_hamming_against_a_loop():
             assert found[a, b] == sum(x != y for x, y in zip(actions[a], actions[b], strict=True)) / 50
 
 
-def test_families_are_as_far_as_their_policies_on_average():
-    """Within a family a policy's distance to itself counts, as in the paper's formula."""
+def test_family_distance_is_the_mean_over_pairs_of_policies():
+    """As in the paper's formula, the mean within a family includes distances of policies to themselves."""
     distances = np.array([[0, 0.5, 1, 0.2], [0.5, 0, 0.6, 0.4], [1, 0.6, 0, 0.8], [0.2, 0.4, 0.8, 0]])
     found = family_distances(distances, {"A": [0, 2], "B": [1], "C": range(1, 4)})
     expected = [
@@ -90,22 +87,19 @@ def test_families_are_as_far_as_their_policies_on_average():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
-# On common states.
-
-
-def test_identical_policies_have_distance_0_and_others_do_not(actions):
+def test_only_identical_policies_have_distance_0(actions):
     distances = hamming_distances(actions)
     assert distances[0, 2] == 0
-    assert distances[0, 3] == 1  # always one action further
+    assert distances[0, 3] == 1  # its action is always the next one
     assert 0 < distances[0, 1] < 1
 
 
 @pytest.mark.slow
-def test_policies_observe_as_the_teammate_with_a_memory(records, monkeypatch):
-    """Against a loop over the same states: counted from each episode's start, seen as the teammate sees it."""
+def test_actions_on_common_states_use_teammate_observations_and_memory(records, monkeypatch):
+    """Compare with expected actions: memory starts with each episode, and observations are the teammate's."""
     monkeypatch.setattr(build, "_visited_records", lambda env, numbers, family, key: records)
-    found = actions_on_common_states(LAYOUT, [policy(2), policy(1, by_state)], steps=STEPS)
-    repeated = np.concatenate([records, records], axis=1)  # once for either family
+    found = actions_on_common_states(LAYOUT, [policy(2), policy(1, act_by_state)], steps=STEPS)
+    repeated = np.concatenate([records, records], axis=1)  # policies have two families
     seen = observe(LAYOUT, repeated, TEAMMATE).sum(axis=(2, 3, 4))
     expected = (2 + np.arange(STEPS)[:, None] + seen) % 6
     np.testing.assert_array_equal(found[0].reshape(seen.shape), expected)

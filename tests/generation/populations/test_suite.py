@@ -1,8 +1,7 @@
-"""Populations on disk: checkpoints and cards, interrupted and resumed runs, the selection of teammates, manifests.
+"""Populations on disk: checkpoints and cards, interrupted runs, selection of teammates, and manifests.
 
-Each algorithm is trained at most once, by the shipped profile `smoke` with one epoch: two members, six updates of 2,048
-steps each.
-Fast tests train LBRDiv alone.
+Each algorithm is trained at most once, with the shipped profile `smoke` and one epoch: two members and six updates of
+2,048 steps. Tests that are not marked slow train only LBRDiv.
 """
 
 from __future__ import annotations
@@ -49,9 +48,9 @@ from tests.helpers.xla_flags import add_xla_flag
 LAYOUT = get_layout("cramped_up")
 SMOKE = load_profile("smoke").teammates
 EACH_KIND = pytest.mark.parametrize("algorithm", ["lbrdiv", pytest.param("comedi", marks=pytest.mark.slow)])
-"""Pairs of policies, and stages; `test_generate.py` trains FCP and BRDiv."""
+"""LBRDiv trains pairs of policies, CoMeDi trains in stages; `test_generate.py` trains FCP and BRDiv."""
 FIRST_MEMBER = {"comedi": 1}
-"""Number of the first policy that may become a teammate; CoMeDi's first one is trained by self-play alone."""
+"""First policy that can become a teammate, if not 0; CoMeDi's policy 0 is trained only by self-play."""
 CONFIG, WIDTHS = replace(SMOKE.ppo, epochs=1), SMOKE.ppo.widths
 
 
@@ -87,7 +86,7 @@ short_cross_play = partial(cross_play.cross_play_returns, episodes=2)
 
 @pytest.fixture(scope="module", autouse=True)
 def few_episodes():
-    """Evaluate checkpoints in 2 episodes, since 20 take longer than the training here."""
+    """Evaluate checkpoints in 2 episodes, since 20 episodes take longer than the training in these tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "cross_play_returns", short_cross_play)
         yield
@@ -95,7 +94,7 @@ def few_episodes():
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Callable[..., Path]:
-    """Return `trained(*algorithms)`: a suite with at least these populations on cramped_up. Read only."""
+    """Return a function from names of algorithms to a suite that contains their populations. Read only."""
     root = tmp_path_factory.mktemp("trained")
 
     def train(*algorithms: str) -> Path:
@@ -111,15 +110,12 @@ def population(root: Path, algorithm: str) -> Path:
 
 
 def weights(folder: Path) -> dict[str, str]:
-    """Return the hash of every policy of a population."""
+    """Return the file hash of every policy of a population, by path."""
     return {str(path.relative_to(folder)): file_hash(path) for path in sorted(folder.rglob(POLICY_WEIGHTS))}
 
 
-# What a population is on disk.
-
-
 @EACH_KIND
-def test_a_population_has_five_checkpoints_of_each_member(trained, algorithm):
+def test_population_has_five_checkpoints_of_each_member(trained, algorithm):
     found = list(suite_checkpoints(trained(algorithm), LAYOUT.name, algorithm))
     first, start = FIRST_MEMBER.get(algorithm, 0), 5 * FIRST_MEMBER.get(algorithm, 0)
     names = [f"{LAYOUT.name}/{algorithm}/m{m}/c{c}" for m in range(first, first + 2) for c in range(5)]
@@ -127,13 +123,13 @@ def test_a_population_has_five_checkpoints_of_each_member(trained, algorithm):
     folder = population(trained(algorithm), algorithm)
     responses = ["m0", "m1"] if algorithm in ("brdiv", "lbrdiv") else []
     assert sorted(path.name for path in folder.glob("responses/*")) == responses
-    assert len(set(weights(folder).values())) == start + 10 + len(responses), "all differ"
+    assert len(set(weights(folder).values())) == start + 10 + len(responses), "all policies differ"
     assert job_of(algorithm, trained(algorithm)).is_finished()
     assert not list(folder.glob("resume*"))
 
 
 @EACH_KIND
-def test_cards_say_what_a_checkpoint_is(trained, algorithm):
+def test_cards_describe_checkpoints_of_a_population(trained, algorithm):
     for number, point in enumerate(suite_checkpoints(trained(algorithm), LAYOUT.name, algorithm)):
         member, checkpoint = divmod(number + 5 * FIRST_MEMBER.get(algorithm, 0), 5)
         card = point.card
@@ -148,8 +144,8 @@ def test_cards_say_what_a_checkpoint_is(trained, algorithm):
         assert card["code_version"]
 
 
-def test_a_cards_return_is_that_checkpoints_own(trained):
-    """Evaluate the final members with their best responses again."""
+def test_returns_on_cards_are_those_of_the_checkpoints(trained):
+    """Evaluate the last checkpoints with their best responses again and compare with the stored returns."""
     folder = population(trained("lbrdiv"), "lbrdiv")
     loaded = [load_policy(folder / f"m{m}/c4") for m in range(2)]
     members = stacked([params for _, params, _ in loaded])
@@ -160,14 +156,14 @@ def test_a_cards_return_is_that_checkpoints_own(trained):
 
 
 @EACH_KIND
-def test_the_log_has_a_line_for_each_update(trained, algorithm):
+def test_population_log_has_a_line_for_each_update(trained, algorithm):
     folder = population(trained(algorithm), algorithm)
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     stages = 3 if algorithm == "comedi" else 1
     assert [(line["stage"], line["update"]) for line in lines] == [(s, u) for s in range(stages) for u in range(6)]
     for line in lines:
         assert line["step"] == 2048 * (line["update"] + 1)
-        ended = line["update"] in (1, 3, 4)  # with steps 400, 800 and 1200, in roll-outs of 256
+        ended = line["update"] in (1, 3, 4)  # these roll-outs of 256 steps contain step 400, 800 or 1200
         assert (line["episodes"] > 0, "self_play" in line) == (ended, ended)
         meets_others = algorithm in ("brdiv", "lbrdiv") or line["stage"] > 0
         assert ("cross_play" in line) == (ended and meets_others)
@@ -177,16 +173,13 @@ def test_the_log_has_a_line_for_each_update(trained, algorithm):
     assert all(line["steps_per_second"] > 0 for line in timing)
 
 
-# Interrupted runs.
-
-
 class Stopped(Exception):
     pass
 
 
 @pytest.fixture
 def stopped(tmp_path, monkeypatch) -> Path:
-    """A suite with LBRDiv, stopped in the last update: the first episodes are over, and the multipliers have moved."""
+    """Return a suite with an LBRDiv training that was stopped in the last update, when multipliers have changed."""
 
     def stop(updates: int, speed: float) -> None:
         if updates == run_of("lbrdiv").updates:
@@ -198,7 +191,7 @@ def stopped(tmp_path, monkeypatch) -> Path:
 
 
 @pytest.mark.slow
-def test_a_stopped_run_resumes_with_its_multipliers_and_only_under_its_settings(trained, stopped):
+def test_stopped_population_resumes_only_with_the_same_settings(trained, stopped):
     before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
     with pytest.raises(
         OptionError,
@@ -215,13 +208,13 @@ def test_a_stopped_run_resumes_with_its_multipliers_and_only_under_its_settings(
     assert not compare_rebuilds(*folders).differences
 
 
-def test_a_folder_takes_one_run_at_a_time(tmp_path):
+def test_second_training_in_a_locked_folder_raises_error(tmp_path):
     with run_lock(population(tmp_path, "fcp")), pytest.raises(BusyError, match="another process works in"):
         job_of("fcp", tmp_path).run()
 
 
 @pytest.mark.parametrize("name", [f"m0/c0/{POLICY_WEIGHTS}", f"m1/c4/{POLICY_CARD}", f"responses/m1/{POLICY_WEIGHTS}"])
-def test_a_changed_byte_or_a_missing_file_makes_a_population_unfinished(trained, tmp_path, name):
+def test_population_with_changed_or_missing_file_is_unfinished(trained, tmp_path, name):
     folder, job = population(tmp_path, "lbrdiv"), job_of("lbrdiv", tmp_path)
     shutil.copytree(population(trained("lbrdiv"), "lbrdiv"), folder)
     assert job.is_finished()
@@ -231,14 +224,14 @@ def test_a_changed_byte_or_a_missing_file_makes_a_population_unfinished(trained,
     assert not job.is_finished()
 
 
-def test_checkpoints_of_an_unfinished_population_are_refused(tmp_path):
+def test_checkpoints_of_an_unfinished_population_raise_error(tmp_path):
     with pytest.raises(OptionError, match=r"fcp: no finished population; run .*--layout cramped_up"):
         list(suite_checkpoints(tmp_path, "cramped_up", "fcp"))
 
 
 @pytest.mark.slow
-def test_a_population_learns_the_same_on_two_devices(tmp_path):
-    """To rounding: half of the policies on each device, one update."""
+def test_population_on_two_devices_learns_the_same_policies(tmp_path):
+    """After one update with half of the policies on each device, parameters agree up to rounding."""
     (stage,) = run_of("fcp").stages
     state, _ = jax.jit(stage.update)(jax.jit(stage.init)(jax.random.fold_in(jax.random.key(0), 0)))
     flags = add_xla_flag("--xla_force_host_platform_device_count=2")
@@ -251,11 +244,8 @@ def test_a_population_learns_the_same_on_two_devices(tmp_path):
         np.testing.assert_allclose(found[name], leaf, rtol=0, atol=1e-4, err_msg=name)
 
 
-# Selection and manifests.
-
-
-def made_up(root: Path, returns: dict[tuple[int, int], float], algorithm: str = "fcp") -> Path:
-    """Return a suite with these returns as teammates by (member, checkpoint); every weight file differs."""
+def write_invented(root: Path, returns: dict[tuple[int, int], float], algorithm: str = "fcp") -> Path:
+    """Write a suite with invented returns of teammates, by (member, checkpoint); all weight files differ."""
     folder = population(root, algorithm)
     for (member, checkpoint), greedy in returns.items():
         params = {"params": {"x": np.array([member, checkpoint, ALGORITHMS.index(algorithm)], np.float32)}}
@@ -268,12 +258,12 @@ def made_up(root: Path, returns: dict[tuple[int, int], float], algorithm: str = 
 
 @pytest.fixture(scope="module")
 def candidates(tmp_path_factory) -> Path:
-    """50 checkpoints of each algorithm; 40 of them exceed the threshold, 5 are at it."""
+    """Return a suite with 50 checkpoints of each algorithm: 40 exceed the threshold of 20, and 5 equal it."""
     root = tmp_path_factory.mktemp("candidates")
     for algorithm in ALGORITHMS:
         returns = {(m, c): 21.0 + m + c for m in range(10) for c in range(5)}
         returns |= {(m, 0): 20.0 for m in range(5)} | {(m, 1): -3.0 for m in range(5)}
-        made_up(root, returns, algorithm)
+        write_invented(root, returns, algorithm)
     return root
 
 
@@ -281,8 +271,8 @@ def paths(points: list[SuiteCheckpoint]) -> list[str]:
     return [point.path for point in points]
 
 
-def test_comedis_first_policy_is_no_candidate(candidates):
-    """CoMeDi trains it by self-play alone, as FCP trains its members."""
+def test_first_policy_of_comedi_is_not_a_candidate(candidates):
+    """CoMeDi's first policy is trained only by self-play, like the members of FCP."""
     found = paths(list(suite_checkpoints(candidates, LAYOUT.name, "comedi")))
     assert found == [f"{LAYOUT.name}/comedi/m{m}/c{c}" for m in range(1, 10) for c in range(5)]
     chosen = select_teammates(candidates, LAYOUT.name, "comedi", train=1000, heldout=0)
@@ -290,7 +280,7 @@ def test_comedis_first_policy_is_no_candidate(candidates):
     assert not [path for path in paths(chosen.train) if "/m0/" in path]
 
 
-def test_only_teammate_returns_above_the_threshold_are_selected(candidates):
+def test_only_checkpoints_with_returns_above_the_threshold_are_selected(candidates):
     chosen = select_teammates(candidates, LAYOUT.name, "fcp", train=1000, heldout=0)
     assert (chosen.candidates, chosen.good, len(chosen.train)) == (50, 40, 40)
     everyone = chosen.train + chosen.heldout
@@ -298,7 +288,7 @@ def test_only_teammate_returns_above_the_threshold_are_selected(candidates):
     assert all(point.card["teammate_return"] > 20 for point in everyone)
 
 
-def test_the_draw_is_fixed_by_its_seed_and_differs_between_algorithms(candidates):
+def test_selection_depends_on_seed_and_algorithm(candidates):
     draws = {
         (a, s): select_teammates(candidates, LAYOUT.name, a, 20, 5, seed=s) for a in ("fcp", "brdiv") for s in (0, 1)
     }
@@ -310,9 +300,9 @@ def test_the_draw_is_fixed_by_its_seed_and_differs_between_algorithms(candidates
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_members_take_turns(tmp_path, seed):
+def test_members_are_selected_in_turn(tmp_path, seed):
     """Member 0 has four good checkpoints, members 1 and 2 have two each."""
-    made_up(tmp_path, {(m, c): 30.0 for m, count in enumerate((4, 2, 2)) for c in range(count)})
+    write_invented(tmp_path, {(m, c): 30.0 for m, count in enumerate((4, 2, 2)) for c in range(count)})
     chosen = select_teammates(tmp_path, LAYOUT.name, "fcp", 6, 1, seed=seed)
     members = [point.card["member"] for point in chosen.heldout + chosen.train]
     assert len(members) == 7
@@ -325,15 +315,15 @@ def test_members_take_turns(tmp_path, seed):
     ("good", "train", "heldout"),
     [(0, 0, 0), (1, 1, 0), (4, 4, 0), (5, 4, 1), (10, 8, 2), (22, 18, 4), (24, 20, 4), (25, 20, 5), (50, 20, 5)],
 )
-def test_few_candidates_are_shared_four_to_one(tmp_path, good, train, heldout):
-    """20 for training and 5 held out are wanted."""
-    made_up(tmp_path, {(k // 5, k % 5): 30.0 if k < good else 5.0 for k in range(50)})
+def test_few_candidates_are_split_four_to_one_into_training_and_held_out(tmp_path, good, train, heldout):
+    """The test asks for 20 teammates for training and 5 held-out teammates."""
+    write_invented(tmp_path, {(k // 5, k % 5): 30.0 if k < good else 5.0 for k in range(50)})
     chosen = select_teammates(tmp_path, LAYOUT.name, "fcp", 20, 5)
     assert (chosen.good, len(chosen.train), len(chosen.heldout)) == (good, train, heldout)
     assert not {*paths(chosen.train)} & {*paths(chosen.heldout)}
 
 
-def test_manifests_read_back(candidates, tmp_path):
+def test_written_manifests_contain_the_selected_teammates(candidates, tmp_path):
     root = tmp_path / "suite"
     shutil.copytree(candidates, root)
     selections = [select_teammates(root, LAYOUT.name, algorithm, 20, 5) for algorithm in ALGORITHMS]

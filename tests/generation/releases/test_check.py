@@ -1,4 +1,4 @@
-"""`icrl4aht-data check A B`."""
+"""The command `icrl4aht-data check A B`, which compares two rebuilds."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from tests.helpers.commands import run_cli
 from tests.helpers.tiny import artefact
 
 
-def test_equal_folders(built):
+def test_check_reports_equal_folders_as_bit_equal(built):
     printed = run_cli("check", built / "a", built / "a")
     assert "bit-equal" in printed
     assert f"{built / 'a'}: made with {xla_threads()} XLA thread" in printed
 
 
-def test_different_thread_counts_are_reported(tmp_path):
+def test_check_reports_different_numbers_of_threads(tmp_path):
     for name, records in (("a", {"t0": {"xla_threads": 1}, "t1": {"xla_threads": 2}}), ("b", {"t0": {}})):
         (tmp_path / name / "meta").mkdir(parents=True)
         (tmp_path / name / "meta/provenance.json").write_text(json.dumps(records))
@@ -31,7 +31,7 @@ def test_different_thread_counts_are_reported(tmp_path):
     assert f"{tmp_path / 'b'}: made with an unknown number of XLA threads" in output
 
 
-def test_differences_are_reported(built, tmp_path):
+def test_check_reports_the_first_difference_of_each_file(built, tmp_path):
     ours = artefact(built / "a")
     theirs = tmp_path / "other"
     shutil.copytree(ours, theirs)
@@ -60,7 +60,7 @@ def test_differences_are_reported(built, tmp_path):
     assert "5 differ" in printed
 
 
-def test_nothing_to_compare(tmp_path):
+def test_check_of_empty_or_missing_folders_raises_error(tmp_path):
     (tmp_path / ".hidden").touch()
     with pytest.raises(OptionError, match="no files to compare"):
         compare_rebuilds(tmp_path, tmp_path)

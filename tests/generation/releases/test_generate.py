@@ -1,4 +1,4 @@
-"""The smallest complete rebuild: collect, resume, package, verify, sample; the learner's speed."""
+"""The smallest complete rebuilds: collected tasks, packaged releases, learned teammates, and invalid folders."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ from tests.helpers.tiny import LEARNED, TINY, artefact
 
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
-def test_releases_verify_and_replay(built, kind):
+def test_generated_releases_pass_deep_verification(built, kind):
     report = verify_release(built / "a" / kind, level="deep")
     assert report.ok, report.findings
     assert (report.histories, report.transitions) == (3, 3 * 500)
 
 
-def test_history_is_the_first_100_of_each_400_steps(built):
+def test_history_has_the_first_100_of_each_400_steps(built):
     history = load_icrl4aht(built / "a" / "lite")[0]
     assert (history.entry.T, history.entry.episodes) == (500, 5)
     assert np.flatnonzero(history.dones[:]).tolist() == [99, 199, 299, 399, 499]
@@ -54,15 +54,15 @@ def test_history_is_the_first_100_of_each_400_steps(built):
     assert [line["step"] for line in metrics] == [640 * (k + 1) for k in range(25)]
 
 
-def test_the_best_streams_are_kept_best_first(built):
+def test_release_keeps_the_best_streams_in_order_of_their_score(built):
     rewards = np.load(artefact(built / "a") / "rewards.npy")
     returns = rewards.reshape(8, 5, 100).sum(axis=-1)
-    scores = 2 * returns.mean(axis=1) - returns.mean(axis=1)  # w = 5: start and end are the same five episodes
+    scores = 2 * returns.mean(axis=1) - returns.mean(axis=1)  # start and end are means over the same five episodes
     kept = [entry.env_idx for entry in load_icrl4aht(built / "a" / "lite").entries]
     assert kept == np.argsort(-scores, kind="stable")[:3].tolist()
 
 
-def test_checkpoints_of_the_ego_are_evenly_spaced(built):
+def test_checkpoints_of_a_learner_are_evenly_spaced(built):
     folder = artefact(built / "a")
     metadata = json.loads((folder / METADATA).read_text())
     assert metadata["checkpoint_updates"] == [5, 10, 15, 20, 25]
@@ -75,7 +75,7 @@ def test_checkpoints_of_the_ego_are_evenly_spaced(built):
         assert (one != other).any()
 
 
-def test_damaged_or_different_artefacts_are_unfinished(built, tmp_path):
+def test_damaged_artefacts_or_other_settings_make_a_task_unfinished(built, tmp_path):
     profile = load_profile(str(built / "tiny.toml"))
     (work,) = profile.units()
     folder = tmp_path / "copy"
@@ -92,22 +92,22 @@ def test_damaged_or_different_artefacts_are_unfinished(built, tmp_path):
 
 
 def rebuild(profile: Path, out: Path, *kinds: Kind) -> str:
-    """Rebuild releases, by default the lite one, and return the printed text."""
+    """Rebuild releases of the given kinds, by default lite, and return the printed text."""
     console = Console(file=StringIO())
     build.build_releases(load_profile(str(profile)), out, kinds or ("lite",), console)
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
-def test_a_folder_with_other_files_is_refused(built, tmp_path):
+def test_rebuild_in_folder_with_other_files_raises_error(built, tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(OptionError, match=r"has other files \(thesis.txt\), expected a rebuild"):
         rebuild(built / "tiny.toml", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
-def test_a_release_of_another_profile_is_not_replaced(built, tmp_path, monkeypatch):
+def test_rebuild_does_not_replace_release_of_another_profile(built, tmp_path, monkeypatch):
     def never(*arguments):
-        raise AssertionError("tasks were collected")
+        raise AssertionError("expected an error before any task is collected")
 
     monkeypatch.setattr(build, "run_jobs", never)
     shutil.copytree(built / "a" / "lite", tmp_path / "lite")
@@ -117,7 +117,7 @@ def test_a_release_of_another_profile_is_not_replaced(built, tmp_path, monkeypat
     assert verify_release(tmp_path / "lite").ok
 
 
-def test_bundling_replaces_the_bundled_release(built, monkeypatch, tmp_path):
+def test_bundle_release_replaces_the_bundled_release(built, monkeypatch, tmp_path):
     monkeypatch.setattr(package, "MINI", tmp_path / "mini")
     for _ in range(2):
         package.bundle_release(built / "a" / "lite")
@@ -126,7 +126,7 @@ def test_bundling_replaces_the_bundled_release(built, monkeypatch, tmp_path):
 
 @pytest.fixture(scope="module", autouse=True)
 def no_distances():
-    """Distances of learned teammates to the test, which take most of a minute to compile, are not measured here."""
+    """Replace distances of learned teammates to the test teammates, which take most of a minute to compile."""
 
     def numbered(layout, policies) -> list[NearestTest]:
         return [NearestTest("H4/t0", 0.5, number) for number, _ in enumerate(policies)]
@@ -138,7 +138,7 @@ def no_distances():
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory) -> Path:
-    """Return a rebuild with learned teammates, all of which pass the selection. Read only."""
+    """Return a rebuild with learned teammates, selected without a threshold for returns. Read only."""
     profile = tmp_path_factory.mktemp("learned") / "learned.toml"
     out = profile.parent / "out"
     profile.write_text(LEARNED)
@@ -150,8 +150,8 @@ def learned(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_released_learned_teammates_reproduce_actions(learned):
-    """On the observations of a complete recorded episode, the rebuilt teammate takes the recorded actions."""
+def test_learned_teammates_of_a_release_reproduce_recorded_actions(learned):
+    """On the observations of a recorded episode, a teammate restored from the release takes the recorded actions."""
     dataset = load_icrl4aht(learned / "lite")
     assert [task.teammate_kind for task in dataset.entries[::3]] == ["fcp", "brdiv"]
     assert {entry.teammate_family for entry in dataset.entries} == {"rl"}
@@ -168,8 +168,8 @@ def test_released_learned_teammates_reproduce_actions(learned):
 
 
 @pytest.mark.slow
-def test_a_release_is_rebuilt_from_its_own_tasks_and_teammates(learned, tmp_path):
-    """Without its suite, to the same bits; the profile of the populations that trained the teammates is not needed."""
+def test_release_is_rebuilt_from_its_tasks_and_teammates(learned, tmp_path):
+    """The rebuild trains no populations, and its files have the same bytes."""
     profile = tmp_path / "learned.toml"
     profile.write_text(LEARNED)
     given = ("--tasks", learned / "lite/meta/tasks.jsonl", "--suite", learned / "lite/teammates")
@@ -182,7 +182,7 @@ def test_a_release_is_rebuilt_from_its_own_tasks_and_teammates(learned, tmp_path
 
 
 @pytest.mark.slow
-def test_releases_with_teammates_verify_and_a_changed_one_is_named(learned, tmp_path):
+def test_verify_names_a_changed_teammate_of_a_release(learned, tmp_path):
     root = tmp_path / "lite"
     shutil.copytree(learned / "lite", root)
     assert verify_release(root, level="deep").ok
@@ -196,7 +196,7 @@ def test_releases_with_teammates_verify_and_a_changed_one_is_named(learned, tmp_
 
 
 @pytest.mark.slow
-def test_a_release_without_the_checkpoints_says_so(learned, tmp_path):
+def test_verify_and_recover_report_missing_teammate_checkpoints(learned, tmp_path):
     dataset = load_icrl4aht(learned / "lite")
     root = to_release(dataset, tmp_path / "lite", "lite")
     shutil.rmtree(root / "teammates")
@@ -211,9 +211,9 @@ def test_a_release_without_the_checkpoints_says_so(learned, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
+def test_repeated_rebuild_runs_no_job_again(learned, monkeypatch):
     def never(*arguments):
-        raise AssertionError("something was done again")
+        raise AssertionError("a finished job was run again")
 
     monkeypatch.setattr(select, "THRESHOLD", -np.inf)
     monkeypatch.setattr(suite._PopulationTraining, "train", never)
@@ -222,7 +222,7 @@ def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
 
 
 @pytest.mark.slow
-def test_all_teammates_below_the_threshold(learned, tmp_path):
+def test_rebuild_fails_if_all_teammates_are_below_the_threshold(learned, tmp_path):
     shutil.copytree(learned / "suite", tmp_path / "suite")
     with pytest.raises(
         FailedJobsError, match=r"no checkpoint of fcp, brdiv exceeds the return of 20 .*raise teammates"

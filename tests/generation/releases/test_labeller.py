@@ -1,4 +1,4 @@
-"""The checkpoint that labels a task's histories: how it is measured and chosen, and where it is written down."""
+"""The checkpoint that labels a task's histories: measured returns, the choice, and records in the release."""
 
 from __future__ import annotations
 
@@ -38,47 +38,42 @@ from icrl4aht_data.writing.convert import to_release
 from tests.helpers.damages import flip_bit
 from tests.helpers.tiny import artefact
 
-# Choice of the checkpoint
 
-
-def in_episodes(*means: float, spread: float = 0.0) -> np.ndarray:
-    """Return the returns (C, E) with these means, and differences between checkpoints of this standard deviation."""
+def returns_with_means(*means: float, spread: float = 0.0) -> np.ndarray:
+    """Return returns (C, E) with the given means; `spread` is the standard deviation of differences of checkpoints."""
     noise = np.random.default_rng(0).normal(size=(len(means), LABEL_EPISODES)) * spread / np.sqrt(2)
     return np.array(means)[:, None] + noise - noise.mean(axis=1, keepdims=True)
 
 
-def test_the_last_checkpoint_labels_unless_an_earlier_one_earns_clearly_more():
-    assert choose_checkpoint(in_episodes(0, 5, 10, 20, 20)) == 4
-    assert choose_checkpoint(in_episodes(0, 0, 0, 0, 0)) == 4
-    assert choose_checkpoint(in_episodes(7)) == 0
-    assert choose_checkpoint(in_episodes(0, 5, 16.9, 3, 0)) == 2
-    assert choose_checkpoint(in_episodes(9, 5, 9, 3, 0)) == 2  # the latest among equals
+def test_last_checkpoint_labels_unless_an_earlier_one_is_clearly_better():
+    assert choose_checkpoint(returns_with_means(0, 5, 10, 20, 20)) == 4
+    assert choose_checkpoint(returns_with_means(0, 0, 0, 0, 0)) == 4
+    assert choose_checkpoint(returns_with_means(7)) == 0
+    assert choose_checkpoint(returns_with_means(0, 5, 16.9, 3, 0)) == 2
+    assert choose_checkpoint(returns_with_means(9, 5, 9, 3, 0)) == 2  # the later of two equal checkpoints
 
 
-def test_clearly_means_two_more_and_two_standard_errors():
-    assert choose_checkpoint(in_episodes(1.9, 0)) == 1
-    assert choose_checkpoint(in_episodes(2.1, 0)) == 0
-    error = 5 / 2.1  # 5 is 2.1 standard errors
-    assert choose_checkpoint(in_episodes(5, 0, spread=error * np.sqrt(LABEL_EPISODES))) == 0
-    assert choose_checkpoint(in_episodes(5, 0, spread=error * np.sqrt(LABEL_EPISODES) * 1.2)) == 1
-
-
-# Measured returns
+def test_earlier_checkpoint_must_be_better_by_2_and_by_two_standard_errors():
+    assert choose_checkpoint(returns_with_means(1.9, 0)) == 1
+    assert choose_checkpoint(returns_with_means(2.1, 0)) == 0
+    error = 5 / 2.1  # a difference of 5 is 2.1 standard errors
+    assert choose_checkpoint(returns_with_means(5, 0, spread=error * np.sqrt(LABEL_EPISODES))) == 0
+    assert choose_checkpoint(returns_with_means(5, 0, spread=error * np.sqrt(LABEL_EPISODES) * 1.2)) == 1
 
 
 @pytest.fixture
 def task(built, tmp_path):
-    """Return the task of `built`, its profile, and a copy of its artefact, packed before."""
+    """Return the task of the fixture `built`, its profile, and a copy of its artefact with measured returns."""
     profile = load_profile(str(built / "tiny.toml"))
     folder = tmp_path / "artefacts" / artefact(built / "a").name
     shutil.copytree(artefact(built / "a"), folder)
-    for kept in artefact(built / "a").parent.glob(".*.teammates.json"):  # facts about the teammate
+    for kept in artefact(built / "a").parent.glob(".*.teammates.json"):  # measured facts about the teammate
         shutil.copy(kept, folder.parent)
     return profile.units()[0].task, profile, folder
 
 
 def with_returns(folder: Path, greedy: list[float]) -> None:
-    """Replace the measurements in an artefact: every episode of a checkpoint has the same return."""
+    """Replace the measured greedy returns in an artefact by one constant for each checkpoint."""
     content = json.loads((folder / LABELLER_RETURNS).read_text())
     content["measured"]["greedy"] = [[value] * LABEL_EPISODES for value in greedy]
     (folder / LABELLER_RETURNS).write_text(json.dumps(content))
@@ -89,17 +84,17 @@ def measured(folder: Path) -> dict:
 
 
 def pack(task: tuple[Task, Profile, Path], target: Path, kind: Kind = "lite", **changes: Any) -> Path:
-    """Pack the task under its profile with changes."""
+    """Package the task into a release, with changes of the profile."""
     chosen, profile, folder = task
     facts = teammate_facts([chosen], folder.parent, target)
     return package_release(folder.parent, target, [Work(chosen)], replace(profile, **changes), target, kind, facts)
 
 
 def never(*arguments):
-    raise AssertionError("measured again")
+    raise AssertionError("returns were measured again")
 
 
-def test_packing_measures_every_checkpoint_once(task, tmp_path, monkeypatch):
+def test_packaging_measures_every_checkpoint_once(task, tmp_path, monkeypatch):
     chosen, profile, folder = task
     found = measured(folder)
     for way in ("greedy", "sampled"):
@@ -123,7 +118,7 @@ def test_packing_measures_every_checkpoint_once(task, tmp_path, monkeypatch):
         lambda content: "[]",
     ],
 )
-def test_measurements_that_are_damaged_or_of_other_checkpoints_are_made_again(task, tmp_path, monkeypatch, damage):
+def test_damaged_or_outdated_measurements_are_repeated(task, tmp_path, monkeypatch, damage):
     chosen, _, folder = task
     before = (folder / LABELLER_RETURNS).read_text()
     assert damage(before) != before
@@ -135,8 +130,8 @@ def test_measurements_that_are_damaged_or_of_other_checkpoints_are_made_again(ta
 
 
 @pytest.mark.slow
-def test_measured_returns_are_those_of_a_loop_over_steps(task, tmp_path):
-    """Greedy returns of the last checkpoint, by the environment and the policies alone."""
+def test_measured_returns_equal_those_of_a_loop_over_steps(task, tmp_path):
+    """Compare greedy returns of the last checkpoint with a loop over steps of the environment."""
     chosen, _, folder = task
     (folder / LABELLER_RETURNS).unlink()
     choose_labeller([folder], chosen, tmp_path)
@@ -165,10 +160,7 @@ def test_measured_returns_are_those_of_a_loop_over_steps(task, tmp_path):
     assert measured(folder)["greedy"][4] == returns.tolist()
 
 
-# Records of the labeller
-
-
-def test_index_provenance_and_card_state_the_labeller(built):
+def test_index_provenance_and_card_describe_the_labeller(built):
     root = built / "a" / "lite"
     found = measured(artefact(built / "a"))
     greedy, sampled = np.mean(found["greedy"], axis=1), np.mean(found["sampled"], axis=1)
@@ -186,7 +178,7 @@ def test_index_provenance_and_card_state_the_labeller(built):
     assert "## Labels" in (root / "README.md").read_text()
 
 
-def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):
+def test_clearly_better_earlier_checkpoint_labels_the_histories(task, tmp_path):
     chosen, _, folder = task
     with_returns(folder, [0, 60, 20, 5, 0])
     root = pack(task, tmp_path / "lite")
@@ -202,12 +194,9 @@ def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):
     assert verify_release(root).ok
 
 
-# The policy in the release.
-
-
 @pytest.fixture
 def with_policies(task, tmp_path) -> Path:
-    """Return a release with the policies of the labellers."""
+    """Return a release that contains the labelling policies."""
     return pack(task, tmp_path / "with", policies=True)
 
 
@@ -215,7 +204,7 @@ def policy_files(root: Path) -> dict[str, str]:
     return {name: digest for name, digest in read_manifest(root).items() if name.startswith("experts/")}
 
 
-def test_policies_are_in_the_release_if_the_profile_says_so(built, with_policies, tmp_path):
+def test_labelling_policies_are_released_if_the_profile_says_so(built, with_policies, tmp_path):
     assert not policy_files(built / "a" / "lite")
     (of_task,) = read_provenance(with_policies / "meta/provenance.json").values()
     assert of_task.expert is not None
@@ -230,7 +219,7 @@ def test_policies_are_in_the_release_if_the_profile_says_so(built, with_policies
     assert policy_files(combine_releases(tmp_path / "both", [full])) == files
 
 
-def test_verify_compares_policies_and_index_with_the_provenance(with_policies):
+def test_verify_compares_labelling_policies_and_index_with_provenance(with_policies):
     root = with_policies
     weights = next(root.glob("experts/*/policy.safetensors"))
     flip_bit(weights)

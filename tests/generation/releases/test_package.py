@@ -1,4 +1,4 @@
-"""Packing: what is kept of learners and of noise histories, how it is labelled, and what is left out."""
+"""Packaging a release: selected streams, noise histories, labels, tasks that are left out, facts about teammates."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def profile(built) -> Profile:
 
 
 def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequence[float], label: float) -> None:
-    """Write the artefact of a learner, whose first streams rise by this, in rewards only, over ten episodes.
+    """Write the artefact of a learner whose first streams improve by `improvements` within ten episodes.
 
-    Its last checkpoint earns `label` as a labeller.
+    The last checkpoint earns `label` as a labeller.
     """
     folder = artefacts / work.name
     shutil.copytree(artefact(built / "a"), folder)
@@ -60,7 +60,7 @@ def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequenc
 
 
 def make_noise(built: Path, work: Work, artefacts: Path) -> None:
-    """Write an artefact of two noise histories."""
+    """Write the artefact of a task with two noise histories."""
     source, folder = artefact(built / "a"), artefacts / work.name
     folder.mkdir(parents=True)
     for name in HistoryArrays._fields:
@@ -86,7 +86,7 @@ def pack(tmp_path: Path, profile: Profile, works: Sequence[Work], facts: dict[st
 
 @pytest.fixture
 def two_learners(built, profile, tmp_path) -> list[Work]:
-    """Return two learners of one task: one with three streams that rise, one with one."""
+    """Return two learners of one task: three streams of the first and one of the second improve by 5 or more."""
     (task,) = make_tasks(profile, 1)
     works = [Work(task, "ppo", learner) for learner in range(2)]
     make_learner(built, works[0], tmp_path / "artefacts", [10, 4, 20, 15], 5.0)
@@ -94,7 +94,7 @@ def two_learners(built, profile, tmp_path) -> list[Work]:
     return works
 
 
-def test_streams_of_both_learners_that_rise_are_kept(two_learners, profile, tmp_path):
+def test_improving_streams_of_both_learners_are_kept(two_learners, profile, tmp_path):
     task_id = two_learners[0].task.task_id
     strict = replace(profile, least_improvement=5.0, oracle_actions=True)
     root = pack(tmp_path, strict, two_learners, {task_id: MATTERS})
@@ -108,7 +108,7 @@ def test_streams_of_both_learners_that_rise_are_kept(two_learners, profile, tmp_
     assert made.filter.least_improvement == 5.0
     assert made.filter.before.return_end == pytest.approx((10 + 4 + 20 + 15 + 3 + 25) / 16, abs=1e-3)
     assert made.expert is not None
-    assert made.expert.return_greedy == 7.0  # of the learner whose labeller earns more
+    assert made.expert.return_greedy == 7.0  # the labeller is of the better learner
     for history in dataset:
         wanted = oracle_labels(LAYOUTS["demo_wide"], history.state[:], history.actions[:].astype(np.int8))
         assert history.entry.has_oracle_actions
@@ -123,7 +123,7 @@ def test_streams_of_both_learners_that_rise_are_kept(two_learners, profile, tmp_
     assert verify_release(root).findings == []
 
 
-def test_no_oracle_actions_where_the_oracle_earns_less_than_the_end(two_learners, profile, tmp_path):
+def test_oracle_labels_are_omitted_if_the_oracle_earns_less_than_learners(two_learners, profile, tmp_path):
     task_id, references = two_learners[0].task.task_id, MATTERS.references
     assert references is not None
     facts = MATTERS._replace(references=replace_fields(references, oracle=-1000.0))
@@ -132,7 +132,7 @@ def test_no_oracle_actions_where_the_oracle_earns_less_than_the_end(two_learners
     assert not dataset.has_labels("oracle").any()
 
 
-def test_streams_are_kept_as_before_where_no_teammate_leaves_headroom(two_learners, profile, tmp_path):
+def test_least_improvement_is_not_required_without_headroom(two_learners, profile, tmp_path):
     task_id = two_learners[0].task.task_id
     root = pack(tmp_path, replace(profile, least_improvement=50.0), two_learners, {task_id: DOES_NOT})
     kept = [(entry.learner, entry.env_idx) for entry in load_icrl4aht(root).entries]
@@ -141,7 +141,7 @@ def test_streams_are_kept_as_before_where_no_teammate_leaves_headroom(two_learne
     assert "No headroom on demo_wide:" in (root / "README.md").read_text()
 
 
-def test_tasks_without_rising_streams_or_headroom_are_left_out(built, two_learners, profile, tmp_path):
+def test_tasks_without_improving_streams_or_headroom_are_left_out(built, two_learners, profile, tmp_path):
     flat = make_tasks(profile, 2)[1]
     works = [*two_learners, *(Work(flat, "ppo", learner) for learner in range(2))]
     for work in works[2:]:
@@ -161,8 +161,8 @@ def test_tasks_without_rising_streams_or_headroom_are_left_out(built, two_learne
         pack(tmp_path, strict, works[2:], facts)
 
 
-def test_tasks_whose_histories_hardly_rise_are_left_out(built, two_learners, profile, tmp_path):
-    """The kept streams of the learners rise by 17.5 on average, those of the other task by 5.5."""
+def test_tasks_with_little_mean_improvement_are_left_out(built, two_learners, profile, tmp_path):
+    """The kept streams of the first task improve by 17.5 on average, those of the second task by 5.5."""
     flat = make_tasks(profile, 2)[1]
     make_learner(built, work := Work(flat, "ppo"), tmp_path / "artefacts", [4, 6, 3, 5], 5.0)
     works, task_id = [*two_learners, work], two_learners[0].task.task_id
@@ -178,7 +178,7 @@ def test_tasks_whose_histories_hardly_rise_are_left_out(built, two_learners, pro
     assert read_info(exempt).left_out == []
 
 
-def test_noise_histories_are_labelled_by_their_script(built, profile, tmp_path):
+def test_noise_histories_are_labelled_by_their_scripted_ego(built, profile, tmp_path):
     (task,) = make_tasks(profile, 1)
     work = Work(task, "noise")
     make_noise(built, work, tmp_path / "artefacts")
@@ -210,15 +210,12 @@ def test_noise_histories_are_labelled_by_their_script(built, profile, tmp_path):
     assert not any(entry.has_oracle_actions for entry in load_icrl4aht(without).entries)
 
 
-# Facts about teammates.
-
-
 def fake_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
     distance = 0.01 if family == "utility_greedy" else 0.3
     return [Draw(layout, family, base_seed, k, "H3/t1", distance, k, 0.0, 1.0, 30.0) for k in range(2)]
 
 
-def test_drawn_teammates_are_looked_up_and_others_measured_once(tmp_path, monkeypatch):
+def test_drawn_teammates_have_stored_facts_and_others_are_measured_once(tmp_path, monkeypatch):
     monkeypatch.setattr(draws_table, "read_draws", fake_draws)
     entry = sample_teammate("assembly_line", 1, "train")
     drawn = make_task("teammate", "train", "demo_wide", entry, 0)
@@ -232,14 +229,14 @@ def test_drawn_teammates_are_looked_up_and_others_measured_once(tmp_path, monkey
         return [DOES_NOT for _ in tasks]
 
     monkeypatch.setattr(measures, "_measure", measure)
-    for _ in range(2):  # the second time from the file
+    for _ in range(2):  # the second call reads the stored file
         facts = teammate_facts([drawn, other], tmp_path, tmp_path)
         assert facts[drawn.task_id] == TeammateFacts(ReferenceEgos(0.0, 1.0, 30.0, 20), NearestTest("H3/t1", 0.3, 1))
         assert facts[other.task_id] == DOES_NOT
     assert calls == [[other.task_id]]
 
 
-def test_the_nearest_test_teammate_of_a_draw_may_be_of_another_family(monkeypatch):
+def test_nearest_test_teammate_can_be_of_another_family(monkeypatch):
     def draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
         (first, *_) = fake_draws(layout, family, base_seed)
         near = replace_fields(first, other="H1/t0", other_distance=0.006)
@@ -253,7 +250,7 @@ def test_the_nearest_test_teammate_of_a_draw_may_be_of_another_family(monkeypatc
     assert nearest == [NearestTest("H1/t0", 0.006, 0), NearestTest("H3/t1", 0.3, 0)]
 
 
-def test_families_that_a_layout_cannot_host_are_named(monkeypatch):
+def test_families_without_usable_draws_are_reported_with_the_reason(monkeypatch):
     monkeypatch.setattr(draws_table, "read_draws", fake_draws)
     monkeypatch.setattr(
         measures, "usable_families", lambda layout: ["recipe_aware_button", "territory", "assembly_line"]
@@ -264,7 +261,7 @@ def test_families_that_a_layout_cannot_host_are_named(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_preset_is_measured(tmp_path):
+def test_facts_of_a_preset_teammate_are_measured(tmp_path):
     task = make_task("teammate", "train", "demo_wide", heuristic_teammate("utility_greedy", "default", 0), 0)
     facts = teammate_facts([task], tmp_path, tmp_path)[task.task_id]
     assert facts.matters

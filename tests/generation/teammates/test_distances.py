@@ -1,4 +1,4 @@
-"""Distances to the test instances and groups of behaviours, by hand; returns of reference egos with small policies."""
+"""Distances of teammates to the test teammates, groups of equal behaviour, and returns of reference egos."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from icrl4aht_data.overcooked.layouts import get_layout
 LAYOUT = get_layout("cramped_up")
 
 
-def test_a_distance_is_measured_on_the_states_of_the_instances_family():
-    """Two families of five instances; two steps of one episode each."""
+def test_distance_is_measured_on_states_of_the_test_teammates_family():
+    """The example has two families of five test teammates, and one episode of two steps for each family."""
     tested = np.zeros((10, 2, 2), np.int8)
     tested[3, :, 0], tested[7, :, 1] = 1, [2, 4]
-    actions = np.array([[[1, 2], [1, 3]], [[0, 0], [1, 4]]], np.int8)  # (teammates, T, episodes)
+    actions = np.array([[[1, 2], [1, 3]], [[0, 0], [1, 4]]], np.int8)  # shape (teammates, T, episodes)
     distances = distances_to_tests(tested, actions)
     np.testing.assert_array_equal(distances[0], [1, 1, 1, 0, 1, 1, 1, 0.5, 1, 1])
     np.testing.assert_array_equal(distances[1], [0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5])
 
 
-def test_behaviours_are_numbered_in_order():
-    """Each acts like the first of a behaviour: 1 of 100 states is too little for one of its own, 2 are not."""
+def test_teammates_are_grouped_into_numbered_behaviours():
+    """A teammate that differs in 1 of 100 states has the same behaviour; with 2 of 100 it has another behaviour."""
     actions = np.zeros((5, 10, 10), np.int8)
     actions[1, 0, :2] = 1
     actions[2, 0, 0] = 1
@@ -50,7 +50,7 @@ def test_behaviours_are_numbered_in_order():
     assert group_behaviours(actions[:0]) == []
 
 
-def test_other_layouts_have_no_common_states():
+def test_common_states_of_unsupported_layout_raise_error():
     with pytest.raises(UnknownNameError, match="unknown layout 'asymm_both_plain'"):
         common_states(get_layout("asymm_both_plain"))
 
@@ -59,18 +59,18 @@ def count(params, key) -> jax.Array:
     return jnp.int32(0)
 
 
-def walks(params, steps, view, key):
-    """Acts by its parameter."""
+def act_by_parameter(params, steps, view, key):
+    """Return the action that the parameter gives."""
     return params, steps + 1
 
 
-def walks_too(params, steps, view, key):
-    """Acts as `walks` does, as a function of its own."""
+def act_by_parameter_too(params, steps, view, key):
+    """Return the action that the parameter gives, like `act_by_parameter`, as a different function."""
     return params, steps + 1
 
 
-def test_returns_belong_to_their_teammates(monkeypatch):
-    """Rewards are replaced by 100 for the teammate's action 2 plus the ego's action: 4 of `stay`, 1 of the oracle."""
+def test_reference_returns_are_in_the_order_of_the_teammates(monkeypatch):
+    """The reward is replaced by the ego's action (`stay` 4, oracle 1), plus 100 for the teammate's action 2."""
 
     def counted(*arguments, **options) -> tuple[object, Rollout]:
         carry, played = roll_out(*arguments, **options)
@@ -82,27 +82,27 @@ def test_returns_belong_to_their_teammates(monkeypatch):
     monkeypatch.setattr(references, "roll_out", counted)
     monkeypatch.setitem(references.REFERENCE_EGOS, "oracle", other)
     monkeypatch.setattr(references, "KEPT_STEPS", 3)
-    actions = {0: walks, 2: walks_too, 5: walks}
+    actions = {0: act_by_parameter, 2: act_by_parameter_too, 5: act_by_parameter}
     mates = [Policy(jnp.int32(action), count, act, "state") for action, act in actions.items()]
     found = reference_returns(LAYOUT, mates, episodes=2)
     stay, random, oracle = found.T
     np.testing.assert_array_equal(stay, [12, 312, 12])
     np.testing.assert_array_equal(oracle, [3, 303, 3])
     assert found.dtype == np.float64
-    np.testing.assert_array_equal(random - random[0], [0, 300, 0])  # the same draws with each
+    np.testing.assert_array_equal(random - random[0], [0, 300, 0])  # equal random actions
     assert 0 < random[0] < 15
     np.testing.assert_array_equal(reference_returns(LAYOUT, mates[1:], episodes=2), found[1:])
 
 
-# The shipped table, on one layout: slow, since all families and the scripted ego are compiled.
+# Tests of the shipped table are slow, since they compile all families and the scripted ego.
 
 SHIPPED = get_layout("demo_wide")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", ["assembly_line", "utility_greedy"])
-def test_a_test_instance_acts_like_itself(family):
-    """Also where its actions are random: the noise of a state is that of the episode, not of the teammate."""
+def test_test_teammate_has_distance_0_to_itself(family):
+    """The distance is 0 also for random actions, since the noise depends on the episode and not on the teammate."""
     entries = published_teammates(SHIPPED.name, family)
     found = nearest_test(SHIPPED, [build_teammate(SHIPPED, entry) for entry in entries])
     assert [near.distance for near in found] == [0.0] * len(entries)
@@ -110,8 +110,8 @@ def test_a_test_instance_acts_like_itself(family):
 
 
 @pytest.mark.slow
-def test_rows_of_the_table_are_measured_again():
-    """Draws of both seeds, apart from the number of their behaviour, which depends on the draws before."""
+def test_measured_draws_equal_the_stored_table():
+    """Draws of both seeds agree except in the number of the behaviour, which depends on earlier draws."""
     numbers = [("assembly_line", 0, 0), ("assembly_line", 0, 31), ("assembly_line", 1, 5)]
     for found, (family, base_seed, theta_id) in zip(measure_draws(SHIPPED, numbers), numbers, strict=True):
         expected = read_draws(SHIPPED.name, family, base_seed)[theta_id]

@@ -1,4 +1,4 @@
-"""Drawn teammates: the shipped table, which draws tasks may have and in which order, and the command that measures."""
+"""Teammates with drawn parameters: the shipped table of measured draws, and the choice of draws for tasks."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ UNCACHED = draws._bundled_draws.__wrapped__
 
 
 def draw(family: str, theta_id: int, behaviour: int = 0, *, base_seed=0, distance=0.5, oracle=30.0) -> Draw:
-    """Return a draw on demo_wide with which stay earns 1 and random 2."""
+    """Return a measured draw on demo_wide: the ego `stay` earns 1 and the ego `random` earns 2."""
     return Draw(
         "demo_wide", family, base_seed, theta_id, "H3/t0", distance, behaviour, 1.0, 2.0, oracle, "H1/t1", distance
     )
 
 
-def with_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *found: Draw) -> None:
+def use_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *found: Draw) -> None:
     write_table(tmp_path / "draws.jsonl", found)
     monkeypatch.setattr(draws, "DRAWS_TABLE", tmp_path / "draws.jsonl")
     monkeypatch.setattr(draws, "_bundled_draws", UNCACHED)
@@ -52,10 +52,7 @@ def number_of(found: Draw) -> tuple[str, str, int, int]:
     return found.layout, found.family, found.base_seed, found.theta_id
 
 
-# The shipped table.
-
-
-def test_the_table_has_every_draw_once():
+def test_draws_table_has_every_draw_once():
     expected = [
         (layout, family, seed, theta_id)
         for layout in TESTED_ON
@@ -68,14 +65,14 @@ def test_the_table_has_every_draw_once():
     assert number_of(read_draws("demo_cook_wide", H1, 1)[3]) == ("demo_wide", H1, 1, 3)
 
 
-def test_the_table_is_as_written(tmp_path):
-    """Writing what was read gives the same bytes."""
+def test_draws_table_is_in_canonical_form(tmp_path):
+    """Reading and writing the table gives the same bytes."""
     write_table(tmp_path / "again.jsonl", reversed(read_measured(DRAWS_TABLE, Draw)))
     assert (tmp_path / "again.jsonl").read_bytes() == DRAWS_TABLE.read_bytes()
 
 
 @pytest.mark.parametrize("layout", TESTED_ON)
-def test_no_chosen_teammate_acts_like_a_test_instance_of_its_family(layout):
+def test_chosen_draws_differ_from_test_teammates_of_their_family(layout):
     for seed in DRAWS_PER_SEED:
         families = usable_families(layout, seed)
         usable = [found for family in families for found in read_draws(layout, family, seed) if found.admissible]
@@ -95,7 +92,7 @@ def training_theta(family: str, theta_id: int) -> dict[str, Any]:
     return sample_teammate(family, theta_id, "train")["theta"]
 
 
-def test_no_validation_teammate_is_a_training_teammate():
+def test_validation_teammates_are_not_training_teammates():
     for track in TRACKS:
         for task in validation_tasks(track):
             layout, family = task.layout.name, task.teammate["family"]
@@ -105,7 +102,7 @@ def test_no_validation_teammate_is_a_training_teammate():
             ]
 
 
-def test_validation_tasks_are_four_a_layout_where_draws_allow_it():
+def test_each_layout_has_up_to_four_validation_tasks():
     tasks = [task for track in TRACKS for task in validation_tasks(track)]
     found = Counter(task.layout.name for task in tasks)
     for layout in TESTED_ON:
@@ -118,7 +115,7 @@ def test_validation_tasks_are_four_a_layout_where_draws_allow_it():
 
 
 @pytest.mark.parametrize("track", TRACKS)
-def test_diverse_tasks_act_unlike_every_test_instance_and_each_other(track):
+def test_diverse_teammates_differ_from_test_teammates_and_each_other(track):
     thetas = []
     for split, base_seed, most in (("train", 2, 12), ("validation", 3, 3)):
         tasks = diverse_tasks(track, split)
@@ -133,32 +130,29 @@ def test_diverse_tasks_act_unlike_every_test_instance_and_each_other(track):
             assert entry == sample_teammate(family, found.theta_id, "diverse", base_seed)
             assert min(found.distance, found.other_distance) >= 0.1
             thetas.append((task.layout.name, family, tuple(entry["theta"].items())))
-    assert len(set(thetas)) == len(thetas)  # none is in both splits
+    assert len(set(thetas)) == len(thetas)  # no draw is in both splits
 
 
-# Order of draws
-
-
-def test_families_take_turns_and_behaviours_come_first(monkeypatch, tmp_path):
+def test_draws_alternate_between_families_and_start_with_new_behaviours(monkeypatch, tmp_path):
     h1 = [draw(H1, 0), draw(H1, 1), draw(H1, 2, behaviour=4), draw(H1, 3, behaviour=4), draw(H1, 4, behaviour=2)]
-    with_table(monkeypatch, tmp_path, *h1, draw(H3, 5), draw(H3, 6))
+    use_table(monkeypatch, tmp_path, *h1, draw(H3, 5), draw(H3, 6))
     assert chosen([H1], 5) == [(H1, 0), (H1, 2), (H1, 4), (H1, 1), (H1, 3)]
     assert chosen([H3, H1], 6) == [(H3, 5), (H1, 0), (H3, 6), (H1, 2), (H1, 4), (H1, 1)]
     assert chosen([H3, H1, H3], 2) == [(H3, 5), (H1, 0)]
     assert chosen([], 0) == chosen([H1], 0) == []
 
 
-def test_draws_with_which_the_ego_matters_more_come_first(monkeypatch, tmp_path):
-    """Among the first draws of the behaviours, and then among the others; the first is the one of least number."""
+def test_draws_with_more_headroom_come_first(monkeypatch, tmp_path):
+    """Draws are sorted by headroom: first the lowest-numbered draw of each behaviour, then all other draws."""
     first = [draw(H1, 0, oracle=20.0), draw(H1, 1, behaviour=1, oracle=50.0), draw(H1, 2, behaviour=2, oracle=-30.0)]
     others = [draw(H1, 3, oracle=25.0), draw(H1, 4, oracle=45.0), draw(H1, 5, behaviour=1, oracle=25.0)]
-    with_table(monkeypatch, tmp_path, *first, *others)
+    use_table(monkeypatch, tmp_path, *first, *others)
     assert [found.spread for found in first] == [19.0, 49.0, 32.0]
     assert [theta_id for _, theta_id in chosen([H1], 6)] == [1, 2, 0, 4, 3, 5]
 
 
-def test_draws_like_a_test_instance_are_left_out(monkeypatch, tmp_path):
-    with_table(monkeypatch, tmp_path, draw(H1, 0, distance=0.0199), draw(H1, 1, distance=0.02), draw(H2, 0, distance=0))
+def test_draws_similar_to_a_test_teammate_are_left_out(monkeypatch, tmp_path):
+    use_table(monkeypatch, tmp_path, draw(H1, 0, distance=0.0199), draw(H1, 1, distance=0.02), draw(H2, 0, distance=0))
     assert usable_families("demo_wide") == [H1]
     assert chosen([H1], 1) == [(H1, 1)]
     with pytest.raises(
@@ -167,27 +161,24 @@ def test_draws_like_a_test_instance_are_left_out(monkeypatch, tmp_path):
         drawn_teammates("demo_wide", [H1, H2], 1)
 
 
-def test_draws_like_a_test_instance_of_another_family_come_last(monkeypatch, tmp_path):
+def test_draws_similar_to_test_teammates_of_other_families_come_last(monkeypatch, tmp_path):
     like = replace(draw(H1, 0, oracle=50.0), other="H4/t0", other_distance=0.0199)
     unlike = replace(draw(H1, 1, oracle=20.0), other="H4/t0", other_distance=0.02)
-    with_table(monkeypatch, tmp_path, like, unlike, draw(H1, 2, behaviour=1, oracle=10.0))
+    use_table(monkeypatch, tmp_path, like, unlike, draw(H1, 2, behaviour=1, oracle=10.0))
     assert [theta_id for _, theta_id in chosen([H1], 3)] == [1, 2, 0]
 
 
-def test_draws_without_headroom_are_left_out_if_others_have_it(monkeypatch, tmp_path):
+def test_draws_without_headroom_are_left_out_if_others_have_headroom(monkeypatch, tmp_path):
     flat, wide = draw(H1, 0, oracle=5.9), draw(H1, 1, oracle=6.0)
-    with_table(monkeypatch, tmp_path, flat, wide, draw(H3, 0, oracle=5.9))
+    use_table(monkeypatch, tmp_path, flat, wide, draw(H3, 0, oracle=5.9))
     assert chosen([H1], 1) == [(H1, 1)]
     with pytest.raises(OptionError, match=f"{H3}: with none of the 1 draws .* differ by 4.9 .*differ by 5 or more"):
         drawn_teammates("demo_wide", [H3], 1)
-    with_table(monkeypatch, tmp_path, flat, replace(wide, distance=0.01), draw(H3, 0, oracle=5.9))
+    use_table(monkeypatch, tmp_path, flat, replace(wide, distance=0.01), draw(H3, 0, oracle=5.9))
     assert chosen([H1, H3], 2) == [(H1, 0), (H3, 0)]
 
 
-# Bad input.
-
-
-def test_wrong_names():
+def test_unknown_names_of_draws_raise_errors():
     with pytest.raises(OptionError, match=f"unknown teammate family 'H4'; valid: {H1}, "):
         drawn_teammates("demo_wide", ["H4"], 1)
     with pytest.raises(UnknownNameError, match="unknown training layout 'asymm_right'"):
@@ -198,7 +189,7 @@ def test_wrong_names():
         read_draws("demo_wide", H1, 4)
 
 
-def test_a_damaged_table_is_named_with_its_line(tmp_path):
+def test_damaged_draws_table_raises_error_with_line_number(tmp_path):
     path = tmp_path / "draws.jsonl"
     write_table(path, [draw(H1, 0)])
     lines = {"[1]": "Expected `object`, got `array`", "{": "", '{"layout":"demo_wide"}': "required field `family`"}
@@ -206,6 +197,3 @@ def test_a_damaged_table_is_named_with_its_line(tmp_path):
         path.write_text(path.read_text().splitlines()[0] + f"\n{line}\n")
         with pytest.raises(TaskFormatError, match=rf"draws\.jsonl, line 2: .*{message}"):
             read_measured(path, Draw)
-
-
-# The command.

@@ -1,5 +1,5 @@
-"""The heuristic teammates: the published play, digit by digit, the published means, every family on every layout as
-either agent, rules that no published play reaches, and their noise."""
+"""The heuristic teammates: published actions and mean returns, every family on every layout as either agent, rules
+that published play does not reach, and random numbers."""
 
 from __future__ import annotations
 
@@ -54,15 +54,15 @@ test_simple (5,2) 000 utility_greedy 2 03051250305125030512532512444444444444445
 test_simple (5,2) 000 utility_greedy 3 030512503051250305125325124444444444444450530512503051250305
 test_simple (5,2) 000 utility_greedy 4 030512503051250305125325124444444444444450530512503051250305
 """
-"""layout, the teammate's start, recipe, family, instance, 60 actions in the published ids; the ego is at (1, 1),
-both face up, and the recipe stays. By an independent simulator of the published teammates."""
+"""Lines of layout, teammate's start, recipe, family, instance, and 60 actions in the published ids, computed by an
+independent simulator of the published teammates. The ego is at (1, 1), both face up, and the recipe is constant."""
 PLAYS = [line.split() for line in PUBLISHED_PLAY.split("\n")[1:-1]]
 
 PUBLISHED_MEANS = {
     "coord_simple": {H1: [0] * 5, H2: [0] * 5, H3: [20.0, 20.0, 0.0, 9.2, 0.0], H4: [40.0] * 5},
     "test_simple": {H1: [0] * 5, H2: [0] * 5, H3: [20.0, 20.0, 0.0, 9.8, 0.0], H4: [40.0] * 5},
 }
-"""Mean returns of t0..t4 with an ego that always stays, 500 episodes of 100 steps, by the same simulator."""
+"""Mean returns of t0..t4 with an ego that always stays, over 500 episodes, by the independent simulator."""
 
 NOISE = """
 0 1 0.403646 0.557784 0.155612 0.673338
@@ -74,24 +74,21 @@ NOISE = """
 3808005281 3946009514 0.226624 0.606609 0.665490 0.032333
 3331961082 2320838513 0.669757 0.632860 0.953956 0.912423
 """
-"""The two words of a step's key and u1..u4, from step 0, as the published code draws them (JAX 0.5.3)."""
+"""Lines of a step's key (two words) and random numbers u1..u4, as the published code draws them (JAX 0.5.3)."""
 
 
 def stacked(family: str, thetas: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Return parameters with a leading axis over thetas."""
+    """Return the parameters of several teammates of a family, stacked along a new first axis."""
     defaults = HEURISTIC_FAMILIES[family].defaults
     dtypes = {name: np.int32 if isinstance(default, int) else np.float32 for name, default in defaults.items()}
     return {name: np.array([theta[name] for theta in thetas], dtype) for name, dtype in dtypes.items()}
 
 
-# The published play.
-
-
 @lru_cache
 def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.ndarray]:
-    """Return actions (100, 5, N) and returns (5, N) of t0..t4 as agent 1 with an ego that stays, under published noise.
+    """Return actions (100, 5, N) and returns (5, N) of t0..t4 as agent 1 with an ego that stays and published noise.
 
-    The last episode starts from the published scene and its recipe stays.
+    The last episode starts from the published state and has a constant recipe.
     """
     layout = LAYOUTS[name]
     entries = published_teammates(name, family)
@@ -101,7 +98,7 @@ def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.
     recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, episodes + 1))
     recipes[:, -1] = layout.recipe_items[0]
 
-    def one(params, record, recipes):
+    def play_episode(params, record, recipes):
         def step(carry, recipe):
             record, memory = carry
             action, memory = policy.act(params, memory, record, jax.random.key(0))
@@ -110,7 +107,7 @@ def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.
 
         return jax.lax.scan(step, (record, policy.init(params, jax.random.key(99))), recipes)[1]
 
-    batch = jax.vmap(jax.vmap(one, (None, 0, 1), 1), (0, None, None), 1)
+    batch = jax.vmap(jax.vmap(play_episode, (None, 0, 1), 1), (0, None, None), 1)
     run = jax.jit(batch)
     params = stacked(family, [entry["theta"] for entry in entries])
     actions, rewards = run(params, np.concatenate([records, pinned]), recipes)
@@ -118,7 +115,7 @@ def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.
 
 
 @pytest.mark.parametrize("line", PLAYS, ids=lambda line: f"{line[3]}-t{line[4]}")
-def test_published_actions(line):
+def test_actions_equal_the_published_actions(line):
     name, start, recipe, family, number, digits = line
     assert (start, recipe, len(digits)) == ("(5,2)", "000", 60)
     actions = played(name, family)[0][:60, int(number), -1]
@@ -127,14 +124,14 @@ def test_published_actions(line):
 
 @pytest.mark.parametrize("name", ["test_simple", pytest.param("coord_simple", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("family", HEURISTIC_FAMILIES)
-def test_published_means(name, family):
+def test_mean_returns_agree_with_published_means(name, family):
     returns = played(name, family)[1][:, :-1]
     published = np.array(PUBLISHED_MEANS[name][family])
     error = returns.std(axis=1) * np.sqrt(1 / returns.shape[1] + 1 / 500)
     assert np.all(np.abs(returns.mean(axis=1) - published) <= 4 * error), (returns.mean(axis=1), error)
 
 
-def test_noise_chain_is_the_published_one():
+def test_random_numbers_equal_those_of_the_published_code():
     key = jax.random.key(1)
     for line in NOISE.split("\n")[1:-1]:
         first, second, *expected = line.split()
@@ -144,12 +141,12 @@ def test_noise_chain_is_the_published_one():
 
 
 def key_of(memory: Any) -> jax.Array:
-    """Return the random key in a heuristic's memory; the memory of H3 is the key itself."""
+    """Return the random key in the memory of a heuristic; H3's memory consists of the key."""
     return getattr(memory, "key", memory)
 
 
 @pytest.mark.parametrize("family", HEURISTIC_FAMILIES)
-def test_fixed_noise_ignores_the_episode_and_seeded_does_not(family):
+def test_fixed_noise_ignores_the_episode_key_unlike_seeded_noise(family):
     for slot in (0, 1):
         teammate = heuristic_teammate(family, "default", 0)
         fixed, seeded = (build_teammate(LAYOUTS["cramped_up"], teammate, slot, noise) for noise in get_args(Noise))
@@ -157,15 +154,13 @@ def test_fixed_noise_ignores_the_episode_and_seeded_does_not(family):
         assert key_of(seeded.init(seeded.params, jax.random.key(123))) == jax.random.key(123)
 
 
-# One step of every family.
-
 ROWS = 48
 ALL_SLOTS = tuple((family, slot) for family in HEURISTIC_FAMILIES for slot in (0, 1))
 
 
 @lru_cache
 def compiled_teammates(layout: Layout, slots: tuple[tuple[str, int], ...] = ALL_SLOTS) -> tuple[dict, Callable]:
-    """Return the policies by (family, agent), and one program for all of them.
+    """Return the policies by (family, agent), and one compiled program that steps all policies.
 
     The program maps parameters and memories (ROWS, ...), in the order of the slots, and records (ROWS, S) to actions
     and memories.
@@ -193,7 +188,7 @@ def first_memories(layout: Layout, slots=ALL_SLOTS) -> dict:
 
 @lru_cache
 def many_params(name: str) -> dict:
-    """ROWS parameter sets for every agent slot: the published ones, the presets and sampled ones."""
+    """Return ROWS parameter sets for every (family, agent): published parameters, presets and sampled parameters."""
     params = {}
     for family, heuristic in HEURISTIC_FAMILIES.items():
         presets = [heuristic_teammate(family, preset, 0)["theta"] for preset in heuristic.presets]
@@ -208,14 +203,14 @@ def many_params(name: str) -> dict:
 
 DEFAULT_LAYOUTS = ("demo_wide",)
 ACTIONS_ON = {"demo_wide": "6311923e202b557d"}
-"""Hash of the actions of all families below: what a change of the code must keep."""
+"""Hash of the actions that all families take in the next test, which changes of the code must not alter."""
 
 
 @pytest.mark.parametrize(
     "name", [name if name in DEFAULT_LAYOUTS else pytest.param(name, marks=pytest.mark.slow) for name in LAYOUTS]
 )
-def test_every_family_plays_every_layout_as_either_agent(name):
-    """In row i, family i % 4 plays with itself; the other families see the same states."""
+def test_every_family_plays_every_layout_as_both_agents(name):
+    """In row i, two agents of family i % 4 play with each other; other families act on the same states."""
     layout = LAYOUTS[name]
     rng = np.random.default_rng(2)
     params, memories = many_params(name), first_memories(layout)
@@ -235,9 +230,9 @@ def test_every_family_plays_every_layout_as_either_agent(name):
     assert digest.hexdigest()[:16] == ACTIONS_ON.get(name, digest.hexdigest()[:16])
 
 
-# Rules that no published play reaches: what a teammate does in one scene, without noise.
+# Single actions without noise, for rules that the published play does not reach.
 
-ZERO, ONE = 4, 16  # ingredients 0 and 1 in the layouts below
+ZERO, ONE = 4, 16  # item bytes of ingredients 0 and 1
 SOUP_0 = 3 * ZERO | COOKED
 DISH_0 = SOUP_0 | PLATE
 MIXED = 2 * ZERO + ONE
@@ -246,7 +241,7 @@ MIXED = 2 * ZERO + ONE
 def one_step(
     layout: Layout, family: str, slot: int, theta: dict[str, float], mine, partner, memory=None, **fields
 ) -> tuple[str, Any]:
-    """Return the action name and memory of a teammate at `mine` (x, y, facing, item in hand), given `partner`."""
+    """Return a teammate's action and memory; `mine` and `partner` are (x, y, facing, item in hand)."""
     slots = SLOTS_ON.get(layout.name, ((family, slot),))
     agents = (mine, partner) if slot == 0 else (partner, mine)
     fields["hands"] = [agent[3] for agent in agents]
@@ -270,56 +265,56 @@ INVADER = {"behavior_mode": territory.INVADER, "strictness": 1.0, "shared_margin
 TWO = {"pot_items": [2 * ZERO]}
 
 CRAMPED_CASES = [
-    # H1: round the partner, or push.
+    # H1 walks around the partner, or keeps moving against the partner.
     (H1, {}, {}, "1 32- 12- left, 1 32- 22- up, 0 21d 31- down, 0 210 22- right, 0 120 22- right, 0 32- 22- up"),
     (H1, {}, DONE, "0 21p 22- right, 1 21p 32d down"),
-    # H1 agent 1 leaves the pot to a partner who carries an ingredient and is about as near.
+    # H1 as agent 1 leaves the pot to a partner that carries an ingredient and is about as near to the pot.
     (H1, {}, {}, "1 220v 210 right, 1 220v 110 interact, 1 220v 21p interact, 0 220v 210 interact, 0 21d 32- right"),
-    # H1 specialists: agent 1 fetches no plate while the partner has none; agent 0 puts its dish down.
+    # A specialized H1 fetches no plate as agent 1 while the partner has no plate, and puts its dish down as agent 0.
     (H1, SPECIALIST, {}, "1 21- 32- down, 1 21- 32p left, 0 21d 32- interact"),
-    # H1 with a plate makes way for a dish.
+    # H1 with a plate makes way for a partner with a dish.
     (H1, {}, {}, "1 21p 11d down, 1 12p 11d right, 1 32p 11d stay, 1 22p 32d left, 0 31p 32d left, 1 21p 12d stay"),
-    # H1: two chefs fetch different ingredients of a mixed recipe.
+    # Two H1 agents fetch different ingredients of a mixed recipe.
     (H1, {}, {"recipe": MIXED}, "1 22- 12- right, 0 22- 32- left"),
     (H1, {}, {"recipe": MIXED, "pot_items": [ZERO + ONE]}, "1 22- 32- left"),
-    # H2 waits at a single access, and walks round the partner.
+    # H2 waits for a partner at the only access cell of its target, and walks around the partner.
     (H2, {"yield_bias": 0.1}, {}, "1 21- 12- stay, 1 21- 32- left"),
     (H2, {"yield_bias": 0.05}, {}, "1 21- 12- left, 1 32- 22- up"),
     (H2, {"yield_bias": 0.3}, {}, "0 32- 22- up"),
     (H2, {"yield_bias": 0.2}, {}, "0 32- 22- left"),
-    # H2 picks up items from counters and lays down a plate that no soup needs.
+    # H2 picks up items from counters, and puts down a plate that no soup needs.
     (H2, {}, {"counters": {(2, 0): ONE}}, "1 21- 32- interact"),
     (H2, {}, {}, "1 21p 32- interact"),
     (H2, {}, FULL, "1 22pv 32- stay"),
-    # A strict H2 without a goal or pile in its territory uses the other's.
+    # A strict H2 without a goal or pile in its territory uses those of the partner's territory.
     (H2, {"strictness": 1.0}, {"recipe": 3 * ONE}, "0 21d 32- right, 0 11- 32- right"),
-    # H3 agent 1, empty-handed, makes room for a partner who carries something; agent 0 does not.
+    # H3 as agent 1 with empty hands makes room for a partner that carries an item; as agent 0 it does not.
     (H3, {}, {}, "1 21- 11p right, 1 31- 21p down, 1 21- 220 right, 1 32- 31d left, 0 21- 11p left"),
-    # H3 agent 1 stays where the next cell touches the partner.
+    # H3 as agent 1 stays if its next cell is adjacent to the partner.
     (H3, {}, {}, "1 32- 12- stay, 0 32- 12- left, 1 22- 31- left"),
-    # H3: an ingredient in the partner's hand counts as in the pot, a dish does not.
+    # H3 counts an ingredient in the partner's hand as if it were in the pot, but not a dish.
     (H3, {}, TWO, "0 22- 310 down, 0 22- 311 left, 0 22- 31d left"),
-    # H3 roles: a soup calls for a plate; so does a cooking one, if urgent.
+    # H3 fetches a plate for a finished soup, and with high plate urgency also for a soup that cooks.
     (H3, {}, DONE, "0 21- 32- left"),
     (H3, {"plate_urgency": 0.6}, FULL, "0 21- 32- left"),
     (H3, {"plate_urgency": 0.5}, FULL, "0 21- 32- down"),
     (H3, PLATER, {}, "0 210 32- interact"),
     (H3, RUNNER, DONE, "0 21p 32- interact, 0 210 32- interact"),
-    # H3 hands an ingredient off next to the pot, in the middle, or near the partner.
+    # H3 puts an ingredient for the partner on a counter next to the pot, in the middle, or near the partner.
     (H3, RUNNER | {"handoff_style": 0}, FULL, "0 210 32- down"),
     (H3, RUNNER | {"handoff_style": 1}, FULL, "0 210 32- interact"),
     (H3, RUNNER | {"handoff_style": 2}, FULL, "0 210 32- right"),
 ]
 ASYMM_CASES = [
-    # H1 carries an ingredient to the pot that misses it, or to any.
+    # H1 carries an ingredient to a pot that lacks this ingredient, or else to any pot.
     (H1, {}, {"recipe": MIXED, "pot_items": [0, 2 * ZERO]}, "1 530< 13- up, 1 531< 13- interact"),
     (H1, {}, {"pot_items": [0, ZERO]}, "1 531< 13- interact"),
-    # An H2 that invades takes no plate of its own side, and wanders, unless soups pile up.
+    # An invading H2 takes no plate from its own side and wanders, unless several soups are ready.
     (H2, INVADER, {"pot_items": [SOUP_0, 0]}, "1 53-> 13- right"),
     (H2, INVADER, {"pot_items": [SOUP_0, SOUP_0]}, "1 53-v 13- interact"),
 ]
 DEMO_CASES = [
-    # A stubborn H3 walks home, with empty hands: agent 1 to (5, 3); agent 0's home is a wall.
+    # A stubborn H3 with empty hands walks to its home cell: (5, 3) for agent 1; for agent 0 this cell is a wall.
     (H3, {"stubbornness": 1.0}, {}, "1 13- 51- right, 1 130 51- right, 0 41- 13- left"),
     (H3, {}, {}, "1 13- 51- down"),
 ]
@@ -328,15 +323,16 @@ SLOTS_ON = {
     "asymm_right": ((H1, 1), (H2, 1)),
     "demo_wide": ALL_SLOTS,
 }
-"""The families and agents in the scenes of a layout; they are compiled together."""
+"""Families and agents that are tested on each layout, and compiled together."""
 SCENES = {"cramped_down": CRAMPED_CASES, "asymm_right": ASYMM_CASES, "demo_wide": DEMO_CASES}
-"""Family, parameters, state, and moves: agent; x, y, hand (- nothing, p plate, d dish, 0 or 1) and facing (up if not
-given) of itself; the same of the partner; the action. cramped_down has floor at (1..3, 1..2), plates at (1, 0), the
-goal at (3, 0), pile 0 at (0, 1), pile 1 at (4, 1) and the pot at (2, 3); asymm_right has pots at (4, 2) and (4, 3)."""
+"""Cases by layout: family, parameters, state, and moves. A move has the agent's number, the agent's and the partner's
+x, y, hand (- nothing, p plate, d dish, 0 or 1) and facing (default up), and the expected action. cramped_down has
+floor at (1..3, 1..2), plates at (1, 0), the goal at (3, 0), piles 0 and 1 at (0, 1) and (4, 1) and the pot at (2, 3);
+asymm_right has pots at (4, 2) and (4, 3)."""
 
 
 @pytest.mark.parametrize("case", [(name, *case) for name, cases in SCENES.items() for case in cases], ids=str)
-def test_scenes(case):
+def test_heuristics_take_expected_actions_in_given_states(case):
     name, family, theta, fields, moves = case
     hands = {"-": 0, "p": PLATE, "d": DISH_0, "0": ZERO, "1": ONE}
     facings = {"": "up", "v": "down", "<": "left", ">": "right"}
@@ -349,7 +345,7 @@ def test_scenes(case):
 @pytest.mark.parametrize(
     ("cell", "stuck", "expected", "stuck_after"), [(7, 3, "right", 4), (8, 3, "right", 0), (7, 2, "interact", 3)]
 )
-def test_h2_wanders_after_four_steps_at_one_cell(cell, stuck, expected, stuck_after):
+def test_h2_wanders_after_four_steps_on_the_same_cell(cell, stuck, expected, stuck_after):
     memory, counters = {"cell": cell, "stuck": stuck}, {(2, 0): ONE}
     mine, partner = (2, 1, "up", 0), (3, 2, "up", 0)
     action, after = one_step(LAYOUTS["cramped_down"], H2, 1, {}, mine, partner, memory, counters=counters)
@@ -357,12 +353,12 @@ def test_h2_wanders_after_four_steps_at_one_cell(cell, stuck, expected, stuck_af
 
 
 UNSIGNED = Layout("unsigned", "test_unsigned", ("WWLWPWW", "0A   AX", "1     B", "WWWWWWW"))
-"""A layout where only the button shows the recipe."""
+"""A layout in which agents see the recipe only after pressing the button."""
 SURE = {"press_L_when_unknown": 1.0, "cost_sensitivity": 0.0}
 
 
-def links(key: jax.Array, n: int) -> list[int]:
-    """Return the data of a key after n splits, each of which keeps the first half."""
+def split_key(key: jax.Array, n: int) -> list[int]:
+    """Return the data of a key after n splits that keep the first of the two new keys."""
     for _ in range(n):
         key = jax.random.split(key)[0]
     return jax.random.key_data(key).tolist()
@@ -371,19 +367,19 @@ def links(key: jax.Array, n: int) -> list[int]:
 @pytest.mark.parametrize(
     ("theta", "memory", "fields", "expected", "steps"),
     [
-        (SURE, {}, {}, "left", 1),  # to the button
-        (SURE | {"cost_sensitivity": 1.0}, {}, {}, "stay", 0),  # hovers; the failed roll keeps the key
-        ({"press_L_when_unknown": 0.0, "strict_recipe": 0.3}, {}, {}, "left", 0),  # guesses pile 0
-        ({"press_L_when_unknown": 0.0, "wrong_ingredient_prob": 1.0}, {}, {}, "left", 1),  # -1 + 1 is pile 0
+        (SURE, {}, {}, "left", 1),  # walks to the button
+        (SURE | {"cost_sensitivity": 1.0}, {}, {}, "stay", 0),  # does not press; the key stays the same
+        ({"press_L_when_unknown": 0.0, "strict_recipe": 0.3}, {}, {}, "left", 0),  # guesses ingredient 0
+        ({"press_L_when_unknown": 0.0, "wrong_ingredient_prob": 1.0}, {}, {}, "left", 1),  # takes ingredient 0
         (SURE | {"idle_prob": 1.0}, {}, {}, "stay", 1),
         (SURE, {"recipe": 3 * ZERO, "seen": 0, "clock": 100}, FULL, "stay", 1),
         (SURE, {"recipe": 3 * ZERO, "seen": 0, "clock": 101}, FULL, "left", 1),
         (SURE, {}, FULL | {"buttons": [5]}, "stay", 1),
     ],
 )
-def test_h1_presses_the_button_for_the_recipe(theta, memory, fields, expected, steps):
+def test_h1_presses_the_button_to_see_the_recipe(theta, memory, fields, expected, steps):
     action, after = one_step(UNSIGNED, H1, 1, theta, (4, 1, "up", 0), (5, 2, "up", 0), memory, **fields)
     assert action == expected
     start = first_memories(UNSIGNED, ((H1, 1),))[H1, 1].key[0]
-    assert jax.random.key_data(after.key).tolist() == links(start, steps)
+    assert jax.random.key_data(after.key).tolist() == split_key(start, steps)
     assert int(after.recipe) == (3 * ZERO if fields.get("buttons") else memory.get("recipe", 0))

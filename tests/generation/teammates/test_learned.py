@@ -1,4 +1,4 @@
-"""Checkpoints as teammates: refused where they do not fit, greedy or sampled, with a memory, in either slot."""
+"""Learned teammates from checkpoints: greedy or sampled actions, memory, both agent slots, and errors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STEPS, ENVS = 5, 3
 
 
 def save(folder: Path, layout: Layout = LAYOUT, widths: Widths = WIDTHS, partners: int = 0, seed: int = 0) -> Any:
-    """Return a checkpoint of random weights, far from uniform; its parameters."""
+    """Save a checkpoint with random parameters, which act far from uniformly; return the parameters."""
     network, rng = ActorCritic(widths, partners), np.random.default_rng(seed)
     shapes = jax.eval_shape(lambda key: network.untrained(key, layout.channels), jax.random.key(0))
     params = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32) * 0.5, shapes)
@@ -39,7 +39,7 @@ def save(folder: Path, layout: Layout = LAYOUT, widths: Widths = WIDTHS, partner
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory) -> Path:
-    """Three checkpoints: a's critic distinguishes four partners, b's none; c is for test_simple."""
+    """Return a suite with checkpoints a (its critic receives one of four partners), b, and c (for test_simple)."""
     root = tmp_path_factory.mktemp("suite")
     save(root / "a", partners=4)
     save(root / "b", seed=1)
@@ -58,7 +58,7 @@ def states(steps: int, seed: int) -> np.ndarray:
 
 
 def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.ndarray:
-    """Return the logits (T, N, 6) of the complete network for a sequence of states."""
+    """Return logits (T, N, 6) of the network, including the critic's part, for a sequence of states."""
     obs = observe(LAYOUT, record, slot)
     network = ActorCritic(WIDTHS, partners)
     reset = np.arange(len(record))[:, None] == np.zeros(ENVS)
@@ -68,7 +68,7 @@ def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.n
 
 
 def played(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
-    """Return actions (T, N) of a policy in N environments with these states, step by step."""
+    """Return actions (T, N) that a policy takes step by step in N environments with the given states."""
     player = policy_player(Environment(LAYOUT), policy, policy.params, slot, ENVS)
     act = jax.jit(player.act)
     zero = jnp.zeros(ENVS, jnp.int32)
@@ -80,11 +80,8 @@ def played(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
     return np.array(actions)
 
 
-# Actions
-
-
 @pytest.mark.parametrize("slot", [EGO, TEAMMATE])
-def test_the_greedy_action_is_the_likeliest_with_the_memory_of_the_episode(tmp_path, slot):
+def test_greedy_action_is_the_likeliest_given_the_episodes_memory(tmp_path, slot):
     params = save(tmp_path / "a", partners=4)
     record = states(STEPS, 2)
     logits = logits_of(params, 4, record, slot)
@@ -93,8 +90,8 @@ def test_the_greedy_action_is_the_likeliest_with_the_memory_of_the_episode(tmp_p
     assert len(np.unique(actions)) > 1
 
 
-def test_sampled_actions_follow_the_distribution_and_greedy_ones_the_mode(suite):
-    """3,000 draws in one state; shares within five standard deviations."""
+def test_sampled_actions_follow_the_policys_probabilities(suite):
+    """Shares of 3,000 sampled actions in one state are within five standard deviations of the probabilities."""
     greedy, sampled = (learned.build_learned(LAYOUT, suite / "b", action) for action in ("greedy", "sampled"))
     record = states(1, 8)[:, :1]
     params = {"params": save(suite.parent / f"{suite.name}-b", seed=1)["params"]}
@@ -114,8 +111,8 @@ def test_sampled_actions_follow_the_distribution_and_greedy_ones_the_mode(suite)
     np.testing.assert_array_equal(draws(greedy), logits.argmax())
 
 
-def test_checkpoints_of_one_shape_share_their_functions(suite):
-    """Policies of two checkpoints with different critics share a compilation."""
+def test_policies_of_different_checkpoints_share_compiled_functions(suite):
+    """Checkpoints share a compiled program even if their critics differ."""
     one, other = (learned.build_learned(LAYOUT, suite / name) for name in "ab")
     elsewhere = learned.build_learned(get_layout("test_simple"), suite / "c")
     assert one.init is other.init is elsewhere.init
@@ -125,22 +122,19 @@ def test_checkpoints_of_one_shape_share_their_functions(suite):
     assert learned.build_learned(LAYOUT, suite / "a", "sampled").act is not one.act
 
 
-# Refusals.
-
-
-def test_a_checkpoint_of_other_channels_is_refused_with_both_shapes(suite):
-    """cramped_up has 35 channels, test_simple 41."""
+def test_checkpoint_of_another_layout_raises_error_with_both_shapes(suite):
+    """Observations have 35 channels on cramped_up and 41 channels on test_simple."""
     with pytest.raises(OptionError) as error:
         learned.build_learned(LAYOUT, suite / "c")
     text = str(error.value)
     for part in (str(suite / "c"), "does not fit cramped_up", "5 x 5 x 35", "(41, 4)", "expected", "(35, 4)"):
         assert part in text
-    assert "gru" not in text, "only what differs"
+    assert "gru" not in text, "the error names only arrays that differ"
     learned.build_learned(get_layout("cramped_down"), suite / "a")
 
 
 @pytest.mark.parametrize("missing", [POLICY_CARD, POLICY_WEIGHTS, "."])
-def test_a_missing_checkpoint_is_a_clear_error(tmp_path, missing):
+def test_incomplete_checkpoint_raises_error_with_expected_files(tmp_path, missing):
     folder = tmp_path / "gone"
     if missing != ".":
         save(folder)
@@ -149,7 +143,7 @@ def test_a_missing_checkpoint_is_a_clear_error(tmp_path, missing):
         learned.build_learned(LAYOUT, folder)
 
 
-def test_other_weights_than_the_task_names_are_refused(suite):
+def test_checkpoint_with_another_hash_than_the_task_raises_error(suite):
     other = entry(suite, "a")
     other["theta"] = {"checkpoint": "b", "sha256": other["theta"]["sha256"]}
     with pytest.raises(TaskFormatError, match=f"sha256 {file_hash(suite / 'b' / POLICY_WEIGHTS)}, expected") as error:

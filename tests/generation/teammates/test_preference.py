@@ -1,4 +1,4 @@
-"""Tasks of the track preference."""
+"""Tasks of the track preference: stored manifests, disjoint splits, and layouts that hide the recipe."""
 
 from __future__ import annotations
 
@@ -16,44 +16,44 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 
 
 @pytest.fixture(scope="module")
-def by_split() -> dict[str, list[Task]]:
+def split_tasks() -> dict[str, list[Task]]:
     return {split: preference_tasks(split) for split in ("train", "validation", "test")}
 
 
-def test_manifests_have_these_tasks(by_split):
-    for split, tasks in by_split.items():
+def test_manifests_contain_the_preference_tasks(split_tasks):
+    for split, tasks in split_tasks.items():
         assert read_tasks(manifest_path(PREFERENCE, split)) == tasks
 
 
-def test_splits_are_disjoint(by_split):
-    """Test teammates, layouts of half of the tests and three of ten dishes are in no training."""
-    layouts = {split: {task.layout_name for task in tasks} for split, tasks in by_split.items()}
+def test_preference_splits_share_no_teammates_and_hold_out_layouts_and_recipes(split_tasks):
+    """Training has no test teammates, no layout of half of the test tasks, and only seven of ten recipes."""
+    layouts = {split: {task.layout_name for task in tasks} for split, tasks in split_tasks.items()}
     assert layouts["train"] == layouts["validation"] == set(PREFERENCE_LAYOUTS["train"])
-    halves = Counter(task.layout_name in layouts["train"] for task in by_split["test"])
+    halves = Counter(task.layout_name in layouts["train"] for task in split_tasks["test"])
     assert halves == {True: 60, False: 60}
-    mates = {split: {teammate_id(task.teammate) for task in tasks} for split, tasks in by_split.items()}
+    mates = {split: {teammate_id(task.teammate) for task in tasks} for split, tasks in split_tasks.items()}
     assert not mates["train"] & (mates["test"] | mates["validation"])
     assert mates["validation"] & mates["test"] == {teammate_id(WATCHER)}
-    dishes = {split: {(t.layout_name, t.recipes) for t in tasks} for split, tasks in by_split.items()}
+    dishes = {split: {(t.layout_name, t.recipes) for t in tasks} for split, tasks in split_tasks.items()}
     for name in PREFERENCE_LAYOUTS["train"]:
         layout = get_layout(name)
         new = len(all_dishes(layout)) - len(training_dishes(layout))
         assert new == {4: 0, 10: 3}[len(all_dishes(layout))]
     assert any(pair not in dishes["train"] for pair in dishes["test"] if pair[0] in layouts["train"])
     of_dish = defaultdict(set)
-    for task in by_split["test"]:
+    for task in split_tasks["test"]:
         (dish,) = task.recipes or (None,)
         assert dish is not None
         held_out = dish not in training_dishes(task.layout)
         number = all_dishes(task.layout).index(dish) if held_out else None
         of_dish[number].add((task.teammate_family, task.teammate["theta_id"] == INSTANCES))
     assert of_dish.keys() == {None, 2, 5, 8}
-    assert all(len(found) >= 4 for found in of_dish.values()), "each held-out dish meets several families"
-    families = {split: {task.teammate_family for task in tasks} for split, tasks in by_split.items()}
+    assert all(len(found) >= 4 for found in of_dish.values()), "each held-out recipe has teammates of several families"
+    families = {split: {task.teammate_family for task in tasks} for split, tasks in split_tasks.items()}
     assert families["train"] == families["test"] == {"H1", "H2", "H3", "H4"}
 
 
-def test_layouts_hide_the_dish_and_are_what_their_names_say():
+def test_preference_layouts_hide_the_recipe_and_match_their_names():
     maps = Counter()
     for split, names in PREFERENCE_LAYOUTS.items():
         for name in names:

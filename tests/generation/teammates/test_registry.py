@@ -1,4 +1,4 @@
-"""The registry of heuristic teammates: parameters, presets, and sampled teammates of the splits."""
+"""The registry of heuristic teammates: parameters, presets, and sampled teammates of each split."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ H1, H2, H3, H4 = "recipe_aware_button", "territory", "assembly_line", "utility_g
 
 
 @pytest.mark.parametrize("family", HEURISTIC_FAMILIES)
-def test_missing_and_unknown_parameters(family):
+def test_missing_or_unknown_parameters_raise_error(family):
     theta = dict(HEURISTIC_FAMILIES[family].defaults)
     first = next(iter(theta))
     theta[f"{first}_"] = theta.pop(first)
@@ -36,14 +36,14 @@ def test_missing_and_unknown_parameters(family):
         (H4, "inertia", None, r"expected `float`, got `null` - at `\$.inertia`"),
     ],
 )
-def test_impossible_parameters(family, name, value, expected):
+def test_parameters_of_wrong_type_or_range_raise_error(family, name, value, expected):
     with pytest.raises(TaskFormatError, match=f"teammate {family}: parameters: {expected}; .*, found "):
         build_teammate(
             LAYOUTS["demo_wide"], {"family": family, "theta": HEURISTIC_FAMILIES[family].defaults | {name: value}}
         )
 
 
-def test_unknown_presets_and_splits():
+def test_unknown_presets_splits_and_families_raise_errors():
     with pytest.raises(UnknownNameError, match=r"preset of assembly_line 'plater'; valid: default"):
         heuristic_teammate(H3, "plater", 0)
     with pytest.raises(UnknownNameError, match=r"split 'tests'.*Did you mean 'test'"):
@@ -62,12 +62,13 @@ assembly_line test plater_deliverer 1 . 0.6-1 0-0.3 *1 . . . . .
 utility_greedy train default,delivery_focused 8-18 6-14 *8 3-8 *8 *4.5 *12 *7 0.2-0.7 0.1-0.5 *1
 utility_greedy test prep_focused,high_inertia,distance_sensitive 5-12 3-8 *8 7-12 *8 *4.5 *12 *7 0.6-1.2 0.5-0.9 *1
 """
-"""Family, split, presets, and of every parameter the range low-high, the list, *width of the full range around the
-preset's value, or . for that value: the published code's, for the splits of the paper's App. B.3."""
+"""Ranges of the published code for the splits of the paper's App. B.3. Each line has family, split, presets and, for
+each parameter, a range low-high, a list of values, * and the width of the full range around the preset's value, or .
+for the preset's value."""
 
 
 @pytest.mark.parametrize("line", RANGES.split("\n")[1:-1])
-def test_samples_stay_in_their_ranges(line):
+def test_sampled_parameters_stay_in_published_ranges(line):
     family, split, presets, *ranges = line.split()
     heuristic = HEURISTIC_FAMILIES[family]
     entries = [sample_teammate(family, number, split) for number in range(12)]

@@ -1,4 +1,4 @@
-"""Teammates that differ widely: their choice by hand, the shipped list, and mixtures with random actions."""
+"""Spread teammates, which behave very differently: the choice, the shipped list, and added random actions."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ def mate(split: str, theta_id: int, oracle: float = 30.0) -> SpreadTeammate:
 
 
 @pytest.fixture
-def three(monkeypatch) -> LayoutSpread:
-    """A list of two training teammates and one for validation, in place of the shipped one."""
+def small_spread(monkeypatch) -> LayoutSpread:
+    """Replace the shipped list by two training teammates and one validation teammate on demo_wide."""
     chosen = (mate("train", 3), mate("validation", 7), mate("train", 1))
     spread = LayoutSpread("demo_wide", 9, 6, 5, chosen)
     monkeypatch.setattr(module, "_bundled_spreads", lambda: {"demo_wide": spread})
     return spread
 
 
-def test_the_farthest_is_chosen_next():
-    """Points on a line: an end and the other end, then the middle; 0.05 is nearer to 0 than allowed."""
+def test_the_farthest_candidate_is_chosen_next():
+    """Of points on a line, both ends are chosen first, then the middle; 0.05 is too near to 0."""
     assert choose_spread(DISTANCES, 0.1, 9) == ([0, 3, 2], [1.0, 1.0, pytest.approx(0.35)])
     assert choose_spread(DISTANCES, 0.04, 9)[0] == [0, 3, 2, 4, 1]
     assert choose_spread(DISTANCES, 0.05, 2)[0] == [0, 3]
@@ -65,25 +65,25 @@ def test_the_farthest_is_chosen_next():
     assert choose_spread(np.zeros((2, 2)), 0.1, 9) == ([0], [1.0])
 
 
-def test_candidates_are_distinct_and_valid():
+def test_spread_candidates_are_distinct_and_valid():
     found = spread_candidates()
     assert {entry["base_seed"] for entry in found} == {SPREAD_SEED}
     assert len({(entry["family"], entry["theta_id"]) for entry in found}) == len(found)
-    assert all(0 <= entry["theta_id"] < 500 for entry in found)  # the tasks' seeds have room for so many
+    assert all(0 <= entry["theta_id"] < 500 for entry in found)  # more would give equal seeds of tasks
     assert {entry["family"] for entry in found} == set(HEURISTIC_FAMILIES)
     assert teammate_id(WATCHER) in {teammate_id(entry) for entry in found}
     for entry in found:
         check_theta(entry)
 
 
-def test_teammates_come_in_order(three):
+def test_spread_teammates_are_returned_in_order_of_the_list(small_spread):
     assert [entry["theta_id"] for entry in spread_teammates("demo_wide", "train", 2)] == [3, 1]
-    assert spread_teammates("demo_cook_wide", "validation", 1) == [three.chosen[1].entry]
+    assert spread_teammates("demo_cook_wide", "validation", 1) == [small_spread.chosen[1].entry]
     assert spread_teammates("demo_simple", "train", 0) == []
-    assert three.chosen[0].entry["theta"] == {"w_deliver": 3.0}
+    assert small_spread.chosen[0].entry["theta"] == {"w_deliver": 3.0}
 
 
-def test_more_than_there_are(three):
+def test_more_spread_teammates_than_listed_raise_error(small_spread):
     numbers = "demo_wide: 2 validation teammates requested .* has 1: 6 of 9 candidates differ .* and 5 of these"
     with pytest.raises(OptionError, match=numbers):
         spread_teammates("demo_wide", "validation", 2)
@@ -93,37 +93,34 @@ def test_more_than_there_are(three):
         read_spread("asymm_right")
 
 
-def test_what_was_measured_is_found_by_the_entry(three):
-    found = find_measured("demo_wide", three.chosen[1].entry)
+def test_measured_values_are_found_by_the_teammate_entry(small_spread):
+    found = find_measured("demo_wide", small_spread.chosen[1].entry)
     assert found is not None
     assert (found.behaviour, found.nearest, found.other_distance, found.oracle) == (1, "H4/t0", 0.4, 30.0)
-    assert find_measured("demo_simple", three.chosen[1].entry) is None
-    assert find_measured("demo_wide", three.chosen[1].entry | {"theta": {"w_deliver": 7.5}}) is None
-    assert find_measured("demo_wide", three.chosen[1].entry | {"theta_id": 2}) is None
+    assert find_measured("demo_simple", small_spread.chosen[1].entry) is None
+    assert find_measured("demo_wide", small_spread.chosen[1].entry | {"theta": {"w_deliver": 7.5}}) is None
+    assert find_measured("demo_wide", small_spread.chosen[1].entry | {"theta_id": 2}) is None
     drawn = sample_teammate("assembly_line", 4, "train")
     assert find_measured("demo_wide", drawn) == find_draw("demo_wide", drawn) is not None
 
 
-def test_rows_count_behaviours(three):
-    (row,) = spread_rows([three])
+def test_spread_table_counts_teammates_and_families(small_spread):
+    (row,) = spread_rows([small_spread])
     assert (row["train"], row["validation"], row["candidates"], row["with_headroom"]) == (2, 1, 9, 5)
     assert (row["families"], row["least_distance"], row["least_to_tests"]) == ("H1:0 H2:0 H3:0 H4:3", 0.25, 0.4)
 
 
-def test_tables_are_read_as_written(three, tmp_path):
+def test_spread_table_is_read_as_written(small_spread, tmp_path):
     path = tmp_path / "spread.jsonl"
-    write_table(path, [three])
-    assert read_measured(path, LayoutSpread) == [three]
+    write_table(path, [small_spread])
+    assert read_measured(path, LayoutSpread) == [small_spread]
     path.write_text(path.read_text("utf-8").replace('"separation"', '"seperation"'), encoding="utf-8")
     with pytest.raises(TaskFormatError, match=r"spread\.jsonl, line 1: .*seperation"):
         read_measured(path, LayoutSpread)
 
 
-# The shipped list.
-
-
 @pytest.mark.parametrize("layout", TESTED_ON)
-def test_the_list_keeps_its_distances(layout):
+def test_listed_teammates_differ_by_the_least_distance(layout):
     spread = read_spread(layout)
     assert 0 < len(spread.chosen) <= MOST_CHOSEN
     assert min(mate.separation for mate in spread.chosen) >= DIVERSE_DISTANCE
@@ -141,13 +138,13 @@ def test_the_list_keeps_its_distances(layout):
         assert max(returns) - min(returns) >= LEAST_HEADROOM or spread.headroom == 0
 
 
-def test_the_list_is_small():
+def test_spread_list_is_a_small_file():
     assert SPREAD_TABLE.stat().st_size < 300_000
 
 
 @pytest.mark.slow
-def test_two_of_the_list_are_measured_again():
-    """Of one family, so that only that one and the test instances are compiled."""
+def test_measured_spread_teammates_match_the_list():
+    """Two teammates of one family are measured, so that only this family and the test teammates are compiled."""
     layout = get_layout("cramped_up")
     spread = read_spread(layout.name)
     family = "assembly_line"
@@ -161,9 +158,6 @@ def test_two_of_the_list_are_measured_again():
         assert distances.min() == pytest.approx(min(mate.distance, mate.other_distance), abs=1e-4)
 
 
-# Mixtures with random actions.
-
-
 def always_interact(params, memory, scene):
     return jnp.int32(5), memory
 
@@ -171,8 +165,8 @@ def always_interact(params, memory, scene):
 SIMPLE = Heuristic("simple", lambda key: (), always_interact, {"a": 0.5}, {}, Sampling((), {}), Sampling((), {}), {})
 
 
-def acted(theta: dict[str, float], noise: Noise = "seeded", seed: int = 0, steps: int = 600) -> np.ndarray:
-    """Return the actions of the simple heuristic in one episode."""
+def actions_of(theta: dict[str, float], noise: Noise = "seeded", seed: int = 0, steps: int = 600) -> np.ndarray:
+    """Return the actions of the heuristic `SIMPLE` in one episode."""
     policy = SIMPLE.build(None, theta, noise=noise)
     layout = get_layout("cramped_up")
     view = Situation(layout.tables, jnp.zeros(64, jnp.uint8))
@@ -185,21 +179,21 @@ def acted(theta: dict[str, float], noise: Noise = "seeded", seed: int = 0, steps
     return np.asarray(jax.lax.scan(step, policy.init(policy.params, key), length=steps)[1])
 
 
-def test_a_mixture_acts_randomly_with_its_chance():
-    assert set(acted({"a": 0.5, RANDOM_ACTIONS: 0.0})) == {5} == set(acted({"a": 0.5}))
-    half, whole = (acted({"a": 0.5, RANDOM_ACTIONS: chance}) for chance in (0.5, 1.0))
+def test_teammate_acts_randomly_with_the_given_probability():
+    assert set(actions_of({"a": 0.5, RANDOM_ACTIONS: 0.0})) == {5} == set(actions_of({"a": 0.5}))
+    half, whole = (actions_of({"a": 0.5, RANDOM_ACTIONS: chance}) for chance in (0.5, 1.0))
     assert abs((half != 5).mean() - 0.5 * 5 / 6) < 0.08
     assert all(abs((whole == action).mean() - 1 / 6) < 0.07 for action in range(6))
-    np.testing.assert_array_equal(half[half != 5], whole[half != 5])  # the same draws, of which fewer count
+    np.testing.assert_array_equal(half[half != 5], whole[half != 5])  # with equal random numbers
 
 
-def test_a_mixture_with_fixed_noise_repeats_every_episode():
+def test_random_actions_with_fixed_noise_repeat_in_every_episode():
     theta = {"a": 0.5, RANDOM_ACTIONS: 0.5}
-    np.testing.assert_array_equal(acted(theta, "fixed", 1), acted(theta, "fixed", 2))
-    assert (acted(theta, "seeded", 1) != acted(theta, "seeded", 2)).any()
+    np.testing.assert_array_equal(actions_of(theta, "fixed", 1), actions_of(theta, "fixed", 2))
+    assert (actions_of(theta, "seeded", 1) != actions_of(theta, "seeded", 2)).any()
 
 
-def test_impossible_chances():
+def test_probability_of_random_actions_above_1_raises_error():
     entry = WATCHER | {"theta": WATCHER["theta"] | {RANDOM_ACTIONS: 1.5}}
     with pytest.raises(TaskFormatError, match=r"expected `float` <= 1.0 - at `\$.random_actions`"):
         check_theta(entry)
