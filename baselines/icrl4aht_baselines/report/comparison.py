@@ -257,8 +257,8 @@ def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> st
     first, second = sorted(scores, key=scores.__getitem__, reverse=True)[:2]
     difference = score_difference(results[first], results[second], cells, scales)
     return (
-        f"The two models with the highest N on the track `teammate` differ by {difference.text(2, '+')}: `{first}` minus "
-        f"`{second}`, paired by task and seed."
+        f"The two models with the highest N on the track `teammate` differ by {difference.text(2, '+')}: `{first}` "
+        f"minus `{second}`, paired by task and seed."
     )
 
 

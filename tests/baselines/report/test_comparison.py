@@ -78,7 +78,8 @@ def test_the_lead_is_the_difference_of_the_two_highest(tmp_path, measured):
     for name, value in {"a": 3.0, "b": 9.0, "c": 5.0}.items():
         folder = write_results(tmp_path / name, name, [value] * 100, track="teammate")
         found = comparison.add_submission(found, make_submission([folder], FACTS))
-    assert "differ by +0.20 (+0.20 to +0.20): `b` minus `c`" in comparison.describe_lead(found.returns(), cell_scales("seeded"))
+    lead = comparison.describe_lead(found.returns(), cell_scales("seeded"))
+    assert "differ by +0.20 (+0.20 to +0.20): `b` minus `c`" in lead
 
 
 def test_table_2_has_the_controls_and_blocks(stored, measured):
