@@ -131,7 +131,9 @@ def test_offline_mode_reads_only_downloaded_files(kind, lite, variable, monkeypa
         fetch_planned(plan_download(url, layout="demo_wide"))
         monkeypatch.setenv(variable, "1")
         assert_equal(load_batch(url), load_batch(lite[0]))
-        with pytest.raises(OfflineError, match=r"offline, but these files are missing.*: .*data/teammate/coord_simple/train-0"):
+        with pytest.raises(
+            OfflineError, match=r"offline, but these files are missing.*: .*data/teammate/coord_simple/train-0"
+        ):
             load_batch(url, "coord_simple", cache="ram")
 
 

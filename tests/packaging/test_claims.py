@@ -58,9 +58,9 @@ def entries() -> tuple[Entry, ...]:
     return tuple(read_index(MINI).entries)
 
 
-def rising_histories() -> tuple[float, ...]:
+def rising_entries() -> tuple[float, ...]:
     rising = [entry for entry in entries() if entry.return_end - entry.return_start >= LEAST_HEADROOM]
-    return len(entries()), len(rising), LEAST_HEADROOM
+    return len(rising), len(entries()), LEAST_HEADROOM
 
 
 def count_best_responses() -> tuple[int, int]:
@@ -132,7 +132,7 @@ def bundled_release_size() -> tuple[int, ...]:
 
 
 CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
-    ("README", "Of the {} bundled histories, {} earn at least {} more", rising_histories),
+    ("README", "return of {} of the {} bundled histories rises by at least {} from", rising_histories),
     ("README", "{} histories of {} tasks on {} layouts: {} steps in {} MB", bundled_release_size),
     ("README", "a delivery is worth {}.", lambda: DELIVERY_REWARD),
     ("README", "more than `stay` in {} of the {} cells", cells_without_headroom),
@@ -146,7 +146,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/protocol", "{} of its modes do not cooperate", count_uncooperative_modes),
     (
         "docs/protocol",
-        "have {} behaviours of {} tasks (`cards/behaviours.json`). H4 has one behaviour on every layout. H1 "
+        "have {} behaviours in {} tasks (`cards/behaviours.json`). H4 has one behaviour on every layout. H1 "
         "has {} behaviours on cramped_down, H2 has {} on test_wide, and all other cells have {}.",
         count_test_behaviours,
     ),
@@ -154,7 +154,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/protocol", "{} steps in profile `paper`", lambda: load_profile("paper").ego.shaping_horizon),
     (
         "docs/protocol",
-        "batch size {}, or {} of size tiny",
+        "batch size is {}, or {} with size `tiny`",
         lambda: (SIZES["small"].cpu_batch, TINY_SIZE.cpu_batch),
     ),
     ("docs/protocol", "{} GRU layers of {}", lambda: (ModelOptions().recurrent_layers, ModelOptions().width)),
@@ -167,7 +167,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/generating", "Draws of one family that are closer than {} to", lambda: SAME_BEHAVIOUR),
     ("docs/generating", "`oracle` differ by {} or more", lambda: LEAST_HEADROOM),
     ("docs/generating", "each artefact keeps {} checkpoints", lambda: POLICY_CHECKPOINTS),
-    ("docs/generating", "each plays {} episodes of {} steps", lambda: (LABEL_EPISODES, KEPT_STEPS)),
+    ("docs/generating", "each checkpoint plays {} episodes of {} steps", lambda: (LABEL_EPISODES, KEPT_STEPS)),
     ("docs/generating", "grids of up to {} rows and {} columns", lambda: (MOST_ROWS, MOST_COLUMNS)),
     (
         "docs/generating",
@@ -188,7 +188,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
         "tasks {} learners 640 environment steps {} recorded transitions {} kept transitions {}",
         paper_plan_sizes,
     ),
-    ("docs/choices", "{} behaviours on {} layouts have one so far", count_best_responses),
+    ("docs/choices", "{} behaviours on {} layouts have a best response so far", count_best_responses),
     ("docs/choices", "plays on {} rearranged versions", lambda: reference.TRACK_PLAY["layout"]["rearranged"]),
 ]
 """Page, text with {} for each number, and what computes these numbers."""

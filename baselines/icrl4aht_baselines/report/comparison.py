@@ -257,8 +257,8 @@ def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> st
     first, second = sorted(scores, key=scores.__getitem__, reverse=True)[:2]
     difference = score_difference(results[first], results[second], cells, scales)
     return (
-        f"The two highest on the track `teammate`, paired by task and seed: `{first}` minus `{second}` is "
-        f"{difference.text(2, '+')}."
+        f"The two models with the highest N on the track `teammate` differ by {difference.text(2, '+')}: `{first}` "
+        f"minus `{second}`, paired by task and seed."
     )
 
 
@@ -356,9 +356,9 @@ def describe_trainings() -> str:
     steps, width = _span([one.steps for one in trained], ",d"), _span([one.width for one in trained], "d")
     better = sum(not one.agent.startswith("best response") for one in behaviours)
     return (
-        f"Behaviours: {len(behaviours)}. Trainings with each: {_span([len(one.seeds) for one in behaviours], 'd')}, of "
-        f"{steps} steps and width {width}. With {better} of these behaviours a stored model earns more: B is its "
-        f"return."
+        f"Best responses exist for {len(behaviours)} behaviours. Trainings with each behaviour: "
+        f"{_span([len(one.seeds) for one in behaviours], 'd')}, of {steps} steps and width {width}. With {better} of "
+        f"these behaviours a stored model earns more, and B is its return."
     )
 
 

@@ -78,7 +78,8 @@ def test_lead_is_the_difference_of_the_two_highest_scores(tmp_path, measured):
     for name, value in {"a": 3.0, "b": 9.0, "c": 5.0}.items():
         folder = write_results(tmp_path / name, name, [value] * 100, track="teammate")
         found = comparison.add_submission(found, make_submission([folder], FACTS))
-    assert "`b` minus `c` is +0.20 (+0.20 to +0.20)" in comparison.describe_lead(found.returns(), cell_scales("seeded"))
+    lead = comparison.describe_lead(found.returns(), cell_scales("seeded"))
+    assert "differ by +0.20 (+0.20 to +0.20): `b` minus `c`" in lead
 
 
 def test_controls_table_has_memory_and_partner_controls_and_blocks(stored, measured):
@@ -115,7 +116,7 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
     assert [path.name for path in paths] == [*comparison.RESULTS_FILES]
     text = paths[0].read_text(encoding="utf-8")
     assert "| `high` | noise | oracle | 10 updates, 2 core-hours | – |" in text and "| `low`" not in text
-    assert "Models of earlier code are there as well: `low`." in text and "None measured (version" in text
+    assert "The rows include models of earlier code: `low`." in text and "None measured (version" in text
     assert paths[1].stat().st_size > 10_000 and len(comparison.figure_layouts()) == 6
     assert len(pd.read_parquet(paths[3])) == len(stored.table)
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "measured.json")

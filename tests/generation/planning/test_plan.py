@@ -63,7 +63,8 @@ def test_estimated_sizes_match_the_bundled_release():
     shards = sum(path.stat().st_size for path in (dataset.root / "data").rglob("*.h5"))
     made = [entry for entry in dataset.entries if entry.source != "agent"]  # others are few
     expected = sum(
-        entry.T * plan.BYTES_PER_STEP["lite", str(entry.source)] + plan.BYTES_PER_HISTORY.get(str(entry.source), 0) for entry in made
+        entry.T * plan.BYTES_PER_STEP["lite", str(entry.source)] + plan.BYTES_PER_HISTORY.get(str(entry.source), 0)
+        for entry in made
     )
     assert shards == pytest.approx(expected, rel=0.1)
 

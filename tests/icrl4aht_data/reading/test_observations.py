@@ -137,7 +137,10 @@ class TestFaultyFiles:
             # Both layouts have equally many channels, so conversion cannot find this fault.
             (edit_line(2, layout="demo_simple"), None),
             (edit_line(2, split="test", layout="demo_wide"), r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)"),
-            (edit_line(1, teammate_kind="other"), r"index\.jsonl: history 1 has .*'other'.*, but its task 'task_a' has"),
+            (
+                edit_line(1, teammate_kind="other"),
+                r"index\.jsonl: history 1 has .*'other'.*, but its task 'task_a' has",
+            ),
             (edit_line(1, T="many"), r"index\.jsonl, line 2: Expected `int`, got `str` - at `\$\.T`"),
             (edit_line(3, layout="nowhere"), r"index\.jsonl, line 4: unknown layout"),
         ],

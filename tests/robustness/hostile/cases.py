@@ -249,9 +249,7 @@ _NAMES = {
     "long": "x" * 300,
 }
 add("release", "leads out of the release", {f"manifest: {name}": add_line(path) for name, path in _NAMES.items()})
-add(
-    "release", "are the same file on some", {"manifest: upper case": add_line(SHARD.replace("teammate", "TEAMMATE"))}
-)
+add("release", "are the same file on some", {"manifest: upper case": add_line(SHARD.replace("teammate", "TEAMMATE"))})
 add("release", "not a file that a release may contain", {"manifest: code": add_line("sitecustomize.py")})
 _many = "".join(f"data/d/d/{number}.h5\n{number:064}  " for number in range(50_000)) + "data/d/d/last.h5"
 add("release", "listed in the manifest, but missing", {"manifest: many lines": add_line(_many)})
@@ -478,7 +476,9 @@ for _message, _make in {"leads out": secret_link, "neither a file": named_pipe, 
 _endless = hdf5(new_dataset((2**39,), "i4", chunks=(4096,), compression="gzip"), _H5)
 add("published", "expected numbers of shape", {"endless rows": _endless})
 add("published", "cannot contain the declared|memory", {"endless history": endless_history})
-add("published", "contradicts the|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published_chunks, _H5)})
+add(
+    "published", "contradicts the|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published_chunks, _H5)}
+)
 add("published", "Expected `int` >= 1", {"rows below zero": entry(_INDEX, T=-5)})
 add("published", "missing", {"group above": entry(_INDEX, h5_group="../0")})
 add("published", "lite", {"circle of groups": hdf5(lambda file, out: file["0"].__setitem__("a", file["0"]), _H5)})
