@@ -132,7 +132,7 @@ def bundled_release_size() -> tuple[int, ...]:
 
 
 CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
-    ("README", "return of {} of the {} bundled histories rises by at least {} from", rising_histories),
+    ("README", "return of {} of the {} bundled histories rises by at least {} from", rising_entries),
     ("README", "{} histories of {} tasks on {} layouts: {} steps in {} MB", bundled_release_size),
     ("README", "a delivery is worth {}.", lambda: DELIVERY_REWARD),
     ("README", "more than `stay` in {} of the {} cells", cells_without_headroom),

@@ -32,7 +32,7 @@ from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import EGO, STAY
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.overcooked.state import swapped
+from icrl4aht_data.overcooked.state import swap_agents
 
 HUMAN = "human"
 """Name of the partner if it is a second person."""
@@ -81,7 +81,7 @@ class PolicyPlayer:
             before: outcome of the previous step for this agent; the field `obs` is not used.
             t: number of the step in the episode, from 0.
         """
-        view: Any = swapped(record) if self.is_ego and self.slot != EGO else record
+        view: Any = swap_agents(record) if self.is_ego and self.slot != EGO else record
         if self.policy.sees != "state":
             obs = observe(self.layout, view[None], EGO, self.policy.sees == "canonical_input")[0]
             view = before._replace(obs=obs)

@@ -31,7 +31,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.cells import BUTTON, WINDOW
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD, PRESS_REWARD, WRONG_DELIVERY_REWARD
-from icrl4aht_data.overcooked.state import POT_STEPS, swapped
+from icrl4aht_data.overcooked.state import POT_STEPS, swap_agents
 
 HOST = "127.0.0.1"
 
@@ -82,7 +82,7 @@ class PlaySession:
         self._views = {VIEWS[0] if recorder else VIEWS[1]}  # views shown in this episode; `_view` is the current one
         self._view = next(iter(self._views))
         self._reward, self._problem, self._moving = 0, "", asyncio.Event()
-        start = [game.record, swapped(game.record)]
+        start = [game.record, swap_agents(game.record)]
         self._layout = [layout_drawings(game.layout, record[None]) for record in start]
 
     # ---- messages to browsers
@@ -106,7 +106,9 @@ class PlaySession:
 
     def _frame_message(self, slot: int) -> dict[str, Any]:
         game, layout = self.game, self._layout[slot]
-        record = game.record if slot == EGO else swapped(game.record)  # each person is shown as agent 0, the blue chef
+        record = (
+            game.record if slot == EGO else swap_agents(game.record)
+        )  # each person is shown as agent 0, the blue chef
         return {
             "kind": "frame",
             "record": record.tolist(),
