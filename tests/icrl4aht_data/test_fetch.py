@@ -132,7 +132,7 @@ def test_offline(kind, lite, variable, monkeypatch):
         fetch_planned(plan_download(url, layout="demo_wide"))
         monkeypatch.setenv(variable, "1")
         assert_equal(batch(url), batch(lite[0]))
-        with pytest.raises(OfflineError, match=r"offline, but these files are missing.*: .*data/teammate/coord_simple/train-0"):
+        with pytest.raises(OfflineError, match=r"files are missing.*: .*data/teammate/coord_simple/train-0"):
             batch(url, "coord_simple", cache="ram")
 
 
