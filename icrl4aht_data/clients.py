@@ -57,7 +57,7 @@ def check_credentials(address: str) -> None:
     if not is_clear:
         raise OptionError(
             "an address (not shown, since it may contain a password): expected SCHEME://HOST:PORT/PATH or "
-            "SCHEME://USER:PASSWORD@HOST/PATH; percent-encode the user name and the password, for example / as %2F"
+            "SCHEME://USER:PASSWORD@HOST/PATH; percent-encode the user name and password, for example / as %2F"
         )
 
 

@@ -150,7 +150,7 @@ class Shard:
         wrong = np.flatnonzero((stored > raw + raw // 1000 + 64) | (raw > DEFLATE_RATIO * stored))
         if len(wrong):
             raise ShardMismatchError(
-                f"{self.path}: {self.describe(int(wrong[0]))} cannot be {raw[wrong[0]]} bytes, compressed; "
+                f"{self.path}: {self.describe(int(wrong[0]))} cannot be decompressed to {raw[wrong[0]]} bytes; "
                 f"fetch meta/ and the shard again"
             )
 

@@ -212,7 +212,7 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
     """Check that all histories of a selection have labels of the given kind.
 
     Returns:
-        The labels.
+        The argument `labels`.
 
     Raises:
         UnknownNameError: if `labels` is not a kind of labels.

@@ -171,8 +171,7 @@ class Batches(Iterator[B], Generic[B]):
         """Continue from the position at which `state_dict` was called.
 
         Raises:
-            OptionError: if the state comes from a sampler with other options or another selection; names the
-                differences.
+            OptionError: if the sampler's options or selection differ from those in the state; names the differences.
         """
         if not isinstance(state, Mapping):
             raise OptionError(f"state = {state!r:.100}: expected the result of state_dict()")

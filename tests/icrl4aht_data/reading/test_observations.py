@@ -219,7 +219,7 @@ class TestWithoutStates:
         dataset = load_icrl4aht(converted_release, task_id="task_c")
         with pytest.raises(LabelsMissingError, match=r"no teammate actions: .* has_teammate_actions = false"):
             dataset[0].teammate_actions  # noqa: B018
-        with pytest.raises(LabelsMissingError, match="some histories have none"):
+        with pytest.raises(LabelsMissingError, match="some histories have no teammate actions"):
             dataset.ad(batch_size=1, length=5, teammate_actions=True)
         for cache in CACHES:
             mixed = load_icrl4aht(converted_release, layout="demo_wide", cache=cache)

@@ -86,7 +86,7 @@ class TestObservations:
         assert len(by_layout) > 1
         rows = list(by_layout.values())
         assert render_observations(rows, channels="canonical").shape == (len(rows), STEPS, 5, 5, 46)
-        with pytest.raises(OptionError, match=r'expected one shape, found .*: give .* take channels="canonical"'):
+        with pytest.raises(OptionError, match=r'expected one shape, found .*: give .* use channels="canonical"'):
             render_observations(rows)
 
     def test_invalid_rows_raise_errors(self, built_release):
