@@ -106,9 +106,8 @@ class PlaySession:
 
     def _frame_message(self, slot: int) -> dict[str, Any]:
         game, layout = self.game, self._layout[slot]
-        record = (
-            game.record if slot == EGO else swap_agents(game.record)
-        )  # each person is shown as agent 0, the blue chef
+        # Each person is shown as agent 0, the blue chef.
+        record = game.record if slot == EGO else swap_agents(game.record)
         return {
             "kind": "frame",
             "record": record.tolist(),

@@ -124,7 +124,7 @@ def test_teammate_policy_acts_after_the_given_actions_end():
 
 def test_recovering_keys_of_unknown_recording_code_raises_error(lite):
     dataset = load_icrl4aht(lite[0])
-    with pytest.raises(NotStoredError, match=r"take dataset\.reset_options"):
+    with pytest.raises(NotStoredError, match=r"use dataset\.reset_options"):
         recorded_draws(dataset, 0)
 
 

@@ -112,7 +112,9 @@ def test_rebuild_does_not_replace_release_of_another_profile(built, tmp_path, mo
     monkeypatch.setattr(build, "run_jobs", never)
     shutil.copytree(built / "a" / "lite", tmp_path / "lite")
     (tmp_path / "other.toml").write_text(TINY)
-    with pytest.raises(OptionError, match="made with tiny, not with profile other, and is not replaced; move it away"):
+    with pytest.raises(
+        OptionError, match="generated with tiny, not with profile other, and is not replaced; move it away"
+    ):
         rebuild(tmp_path / "other.toml", tmp_path)
     assert verify_release(tmp_path / "lite").ok
 
@@ -205,7 +207,7 @@ def test_verify_and_recover_report_missing_teammate_checkpoints(learned, tmp_pat
     assert report.ok
     assert any("2 tasks have learned teammates whose checkpoints" in note for note in report.notes)
     with pytest.raises(
-        OptionError, match=r"checkpoint \w{64} is missing, the teammate of history 0: .*made without it"
+        OptionError, match=r"checkpoint \w{64} is missing, which is the teammate of history 0; copy the checkpoint"
     ):
         recover_teammate(load_icrl4aht(root), 0)
 
