@@ -85,7 +85,7 @@ def jaxmarl_training(script: Path, env: MultiAgentEnv, config: PPOConfig, update
 
 
 def _load_script(path: Path) -> ModuleType:
-    """Import the copy of JaxMARL's script as a module."""
+    """Import our copy of JaxMARL's training script as a module."""
     silent: Any = ModuleType("silent")
     silent.main = lambda **_: lambda function: function
     silent.log = lambda metric: None

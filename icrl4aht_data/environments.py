@@ -81,4 +81,4 @@ def make_environment(**options: Any) -> gymnasium.Env:
         register_environments()
         return gymnasium.make(TASK_ENVIRONMENT, **options)
     except ImportError as error:
-        raise OptionError(f"an environment needs {error.name or error}; run {install_command('gym')}") from error
+        raise OptionError(f"an environment needs {error.name or error}: {install_command('gym')}") from error

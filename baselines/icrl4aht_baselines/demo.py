@@ -220,7 +220,7 @@ def draw_adaptation(runs: Sequence[EvaluationRun], path: Path) -> None:
 
 
 def _draw_best_episode(dataset: Dataset, path: Path) -> None:
-    """Draw the best episode of the history with the highest final return; of equal ones the latest."""
+    """Draw the best episode of the history with the highest final return, the latest one if several are equal."""
     history = dataset[int(np.argmax(dataset.column("return_end")))]
     returns = history.returns()
     best = len(returns) - 1 - int(np.argmax(returns[::-1]))

@@ -15,6 +15,7 @@ from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.publishing.build import check_valid, first_problems
+from icrl4aht_data.utils.text import counted_noun
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -131,8 +132,8 @@ def _complete_plan(api: HfApi, plan: Upload, folder: Path, private: bool) -> Upl
         listed = read_manifest(_get_manifest(api, plan.repo, "main").parent)
     if unknown := [name for name in foreign if name not in listed]:
         raise UploadError(
-            f"{plan.repo}: has {len(unknown)} files that belong to no release, such as {unknown[0]}: expected an empty "
-            "repository or one with a release; remove them, or give another repository"
+            f"{plan.repo}: contains {counted_noun(len(unknown), 'file')} outside any release, such as {unknown[0]}: "
+            "expected an empty repository or a release; remove such files, or give another repository"
         )
     return replace(plan, private=private, deletes=foreign)
 

@@ -19,7 +19,7 @@ _LISTED = 10  # maximum number of names of a list in a text
 
 
 def listed_names(names: Sequence[str]) -> str:
-    """Return a list of names as text; a long list is shortened, such as "a, b and 198 others"."""
+    """Return a list of names as text. A long list is shortened, for example to "a, b and 198 others"."""
     if len(names) <= _LISTED:
         return ", ".join(names)
     return f"{', '.join(names[: _LISTED - 1])} and {len(names) - _LISTED + 1} others"

@@ -288,7 +288,7 @@ def _teammate_rows(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[
                 "seed": task and task.teammate.get("base_seed"),
                 "sources": sorted({one.first.source for one in own}),
                 "references": references and references.returns,
-                "matters": references and references.has_headroom,
+                "matters": references and references.egos_differ,
                 "nearest_test": nearest and msgspec.structs.asdict(nearest),
             }
         )
@@ -318,7 +318,7 @@ def _layouts(info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str,
     Args:
         info: info of the release, with a summary of each layout.
         titles: titles of the layouts by name, see `layout_title`.
-        matters: `ReferenceEgos.has_headroom` of each teammate, by layout title.
+        matters: `ReferenceEgos.egos_differ` of each teammate, by layout title.
     """
     rows = []
     for title in dict.fromkeys(titles.values()):

@@ -46,7 +46,7 @@ from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.writing.convert import HistoryProgress
 from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_published_index
-from icrl4aht_data.writing.published_views import PADDING, complete_views, is_short
+from icrl4aht_data.writing.published_views import PADDING, complete_views, has_missing_rows
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, as_path, atomic_folder
 
@@ -298,7 +298,7 @@ class _PublishedHistory:
     @property
     def short(self) -> bool:
         """Whether the observations have fewer than 5 rows and need padding, see `published_views`."""
-        return is_short(get_layout(self.line["layout"]), self.line["obs_shape"])
+        return has_missing_rows(get_layout(self.line["layout"]), self.line["obs_shape"])
 
     def field_names(self) -> list[str]:
         """Return the names of the arrays of this history to convert."""

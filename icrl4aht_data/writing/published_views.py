@@ -24,7 +24,7 @@ PADDING = (
 """Note about padded observations for meta/provenance.json."""
 
 
-def is_short(layout: Layout, obs_shape: tuple[int, ...]) -> bool:
+def has_missing_rows(layout: Layout, obs_shape: tuple[int, ...]) -> bool:
     """Return whether observations of this shape have fewer than 5 rows, as on a map with fewer than 5 rows."""
     return layout.height < WINDOW and tuple(obs_shape) == (layout.height, *layout.obs_shape[1:])
 

@@ -212,8 +212,8 @@ def _heuristic_teammates(teammates: _Teammates) -> dict[Layout, dict[str, dict[s
     for layout, _ in teammates:
         if layout.recipes != get_layout(layout.name).recipes:
             raise OptionError(
-                f"{layout.name}: has tasks with a fixed dish, which rearranged layouts and four recipes do not keep; "
-                f"leave out --rearranged and --four-recipes, or these tasks"
+                f"{layout.name} has tasks with a fixed dish, and --rearranged and --four-recipes change the dishes; leave "
+                f"out these options, or select other tasks"
             )
     found: dict[Layout, dict[str, dict[str, Policy]]] = {layout: {} for layout, _ in teammates}
     for (layout, kind), mates in teammates.items():
@@ -261,7 +261,7 @@ def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
     if dataset is not None:
         for layout, task_id in zip(dataset.column("layout"), dataset.column("task_id"), strict=True):
             made = dataset.provenance.get(str(task_id))
-            own = made is None or made.references is None or made.references.has_headroom
+            own = made is None or made.references is None or made.references.egos_differ
             matters[str(layout)] = matters.get(str(layout), False) or own
     return {layout: 1.0 if found else FLAT_SHARE for layout, found in matters.items()}
 

@@ -141,7 +141,7 @@ def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
 
 
 def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
-    """Return stored results with submitted results added, or replaced if `Submission.update` is set."""
+    """Return stored results plus submitted ones, which replace stored ones if `Submission.update` is set."""
     controls = {one.control for one in found.evaluations}
     tables, curves = [], defaultdict(list)
     for one, run in submitted_runs(found):

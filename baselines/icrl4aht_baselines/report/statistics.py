@@ -40,7 +40,7 @@ class MeanInterval(NamedTuple):
     p: float = float("nan")
 
     def range(self, digits: int = 1, sign: str = "") -> str:
-        """Return the interval as text, such as "(0.1 to 0.4)"; an empty text without an interval."""
+        """Return the interval as text, such as "(0.1 to 0.4)", or an empty string if there is no interval."""
         return "" if np.isnan(self.low) else f"({self.low:{sign}z.{digits}f} to {self.high:{sign}z.{digits}f})"
 
     def text(self, digits: int = 1, sign: str = "") -> str:
@@ -141,7 +141,7 @@ def _estimate(groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R
 
 
 def interquartile_mean(values: Float[np.ndarray, " U"]) -> MeanInterval:
-    """Return the mean of the middle half of some values, with its BCa bootstrap interval (Agarwal et al. 2021)."""
+    """Return the interquartile mean of values, with its BCa bootstrap interval (Agarwal et al. 2021)."""
     mean = float(trim_mean(values, 0.25)) if len(values) else float("nan")
     if len(values) <= _LEAST_FREEDOM:
         return MeanInterval(mean)

@@ -207,8 +207,8 @@ def _check_name(found: Submission, where: str) -> None:
         ) from error
     if found.agent.endswith(tuple(f" ({way})" for way in OTHER_WAYS)):
         raise OptionError(
-            f"{where}: the agent {found.agent} has the name of another play mode, which its folder shows; give a "
-            f"--name without it"
+            f"{where}: the agent name {found.agent!r} ends with a play mode, which the settings state already; give "
+            f"a --name without it"
         )
 
 
@@ -220,8 +220,8 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
         raise OptionError(f"{where}: the settings have no {error}, expected those of `evaluate`") from error
     if code != version("icrl4aht-data"):
         raise OptionError(
-            f"{where}: results of version {code}, expected {version('icrl4aht-data')}, the installed one: evaluate "
-            f"again, or submit with that version"
+            f"{where}: made with icrl4aht-data {code}, but {version('icrl4aht-data')} is installed; evaluate again, or "
+            f"install {code} to submit"
         )
     if protocol != rules.settings:
         raise OptionError(f"{where}: protocol {protocol}, expected {rules.settings}; evaluate with these rules")

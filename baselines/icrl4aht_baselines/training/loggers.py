@@ -69,7 +69,7 @@ def _wandb(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
 
 @contextmanager
 def _trackio(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
-    """Log to a Trackio database, in the folder unless an environment variable such as `TRACKIO_DIR` is set."""
+    """Log to a Trackio database in the run's folder, or where environment variables such as `TRACKIO_DIR` say."""
     from huggingface_hub import constants
 
     wanted = os.environ.get("TRACKIO_DIR") or str(folder.absolute())

@@ -91,11 +91,11 @@ class NoisyChoice(NamedTuple):
     clean: Int[Array, " M"]
 
 
-EpisodeBatch = tuple[np.ndarray, np.ndarray]
+ScriptedBatch = tuple[np.ndarray, np.ndarray]
 """Episodes that are played at once: history numbers and episode numbers, int (M,) each."""
 
 
-def scripted_batches(source: str, config: NoiseConfig) -> list[EpisodeBatch]:
+def scripted_batches(source: str, config: NoiseConfig) -> list[ScriptedBatch]:
     """Return the batches of episodes of a task, in the order of play."""
     if source == "search":  # one episode of all histories at once, because the script remembers earlier episodes
         histories = np.arange(config.histories)
@@ -110,8 +110,8 @@ def scripted_batches(source: str, config: NoiseConfig) -> list[EpisodeBatch]:
 
 
 def play_scripted_histories(
-    layout: Layout, teammate: Policy, seed: int, source: str, batches: Sequence[EpisodeBatch], schedules: np.ndarray
-) -> Iterator[tuple[EpisodeBatch, ScriptedEpisodes]]:
+    layout: Layout, teammate: Policy, seed: int, source: str, batches: Sequence[ScriptedBatch], schedules: np.ndarray
+) -> Iterator[tuple[ScriptedBatch, ScriptedEpisodes]]:
     """Play batches of a task's episodes, with one compilation per teammate family and size class of layouts.
 
     The device plays the next batch while the caller uses the yielded batch.

@@ -276,9 +276,9 @@ class ArrayWriter:
         self._recording += time.perf_counter() - began
 
     def timing(self, steps: int) -> dict[str, float]:
-        """Return the steps per second, the seconds in all and the seconds spent on recording, after `steps` more steps.
+        """Return the steps per second, the total seconds and the seconds of recording, after `steps` more steps.
 
-        The numbers start at the end of the first batch, because the first batch includes compilation.
+        Measurement starts after the first batch, because that batch includes compilation.
         """
         now = time.perf_counter()
         self._steps, seconds = self._steps + steps, now - self._started

@@ -119,7 +119,7 @@ def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 class SaveInterval:
-    """Schedule for saving a training: after the last update, and after every interval.
+    """Schedule for saving a training run: after a number of updates or seconds, and after the last update.
 
     Args:
         last: number of the last update.

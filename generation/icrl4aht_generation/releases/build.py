@@ -114,7 +114,7 @@ def train_teammates(
     units, left_out = [], []
     for work in profile.units(learned):
         earned = of_teammate.get(work.task.teammate_key)
-        if earned is None or earned.has_headroom:
+        if earned is None or earned.egos_differ:
             units.append(work)
         elif work.learner == 0:
             reason = f"the ego does not matter: {earned.describe()}"

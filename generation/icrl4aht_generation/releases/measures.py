@@ -109,7 +109,7 @@ class TeammateFacts(NamedTuple):
     @property
     def matters(self) -> bool:
         """Whether an ego can raise the return with this teammate."""
-        return self.references.has_headroom
+        return self.references.egos_differ
 
 
 def teammate_facts(

@@ -103,7 +103,7 @@ def test_output_folder_with_other_files_raises_error(tmp_path):
         ({"seeds": 3}, r"seeds = 3: expected a sequence of integers"),
         ({"seeds": ()}, r"seeds = \(\): expected a sequence of integers"),
         ({"seeds": (True,)}, "seeds = True: expected an integer"),
-        ({"seeds": (1, 1)}, r"seeds = \[1, 1\]: expected different ones"),
+        ({"seeds": (1, 1)}, r"seeds = \[1, 1\]: expected different seeds"),
         ({"protocol": "sedeed"}, "unknown protocol 'sedeed'.*Did you mean 'seeded'"),
         ({"protocol": 5}, "unknown protocol 5"),
         ({"make_ego": 5}, "make_ego = 5: expected a function layout -> ego"),

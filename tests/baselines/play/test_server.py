@@ -154,7 +154,7 @@ def test_game_continues_after_a_lost_connection():
             assert player.send(action="x")["kind"] == "problem"
 
 
-def test_failed_write_of_a_record_is_shown_and_repeated(tmp_path, monkeypatch):
+def test_failed_record_write_is_shown_and_retried(tmp_path, monkeypatch):
     session = new_session("H2/t3", episodes=2, steps=3, record=tmp_path / "record")
     assert session.recorder
     session.recorder.pseudonym = "someone"

@@ -58,7 +58,7 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
     [
         (lambda c, one, task: c.update(agent="search"), "search has the name of a reference ego; give another --name"),
         (lambda c, one, task: c.update(agent="ad-rising"), "ad-rising has the name of a bundled model; give another"),
-        (lambda c, one, task: c.update(agent="rule (greedy)"), "has the name of another play mode"),
+        (lambda c, one, task: c.update(agent="rule (greedy)"), "ends with a play mode"),
         (lambda c, one, task: c.update(agent="a | b"), "not a file of results: .*matching regex"),
         (lambda c, one, task: c.update(best_responses="99"), r"best responses of version '99', expected '0'"),
         (lambda c, one, task: one["settings"]["details"].clear(), "no declaration of the training data"),
@@ -91,7 +91,7 @@ def test_results_that_cannot_be_submitted_raise_errors(tmp_path):
         make_submission([folder], FACTS)
     for name, value, message in (
         ("code_version", "0.0.1", "results of different settings in one folder"),
-        ("code_version", "0.0.1", r"results of version 0\.0\.1, expected"),
+        ("code_version", "0.0.1", r"made with icrl4aht-data 0\.0\.1, but"),
     ):
         paths = sorted((folder / "tasks").iterdir())
         for path in paths[:1] if "different" in message else paths:

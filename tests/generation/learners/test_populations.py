@@ -185,7 +185,7 @@ def test_slot_weights_follow_the_equations_of_the_paper(algorithm, memory):
 
 
 def random_returns(k: int, rng: np.random.Generator, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean returns of pairs, float32 (2k, 2k), and bool (2k, 2k), which pairs were seen; others are NaN.
+    """Return the mean return of each pair, float32 (2k, 2k), NaN for unseen pairs, and a mask of seen pairs.
 
     Only pairs of a best response as the ego and a confederate as the teammate can be seen.
     """

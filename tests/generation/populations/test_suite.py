@@ -163,7 +163,7 @@ def test_population_log_has_a_line_for_each_update(trained, algorithm):
     assert [(line["stage"], line["update"]) for line in lines] == [(s, u) for s in range(stages) for u in range(6)]
     for line in lines:
         assert line["step"] == 2048 * (line["update"] + 1)
-        ended = line["update"] in (1, 3, 4)  # these roll-outs of 256 steps contain step 400, 800 or 1200
+        ended = line["update"] in (1, 3, 4)  # an episode of 400 steps ends in these rollouts of 256 steps
         assert (line["episodes"] > 0, "self_play" in line) == (ended, ended)
         meets_others = algorithm in ("brdiv", "lbrdiv") or line["stage"] > 0
         assert ("cross_play" in line) == (ended and meets_others)

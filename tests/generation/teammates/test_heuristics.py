@@ -230,7 +230,7 @@ def test_every_family_plays_every_layout_as_both_agents(name):
     assert digest.hexdigest()[:16] == ACTIONS_ON.get(name, digest.hexdigest()[:16])
 
 
-# Single actions without noise, for rules that the published play does not reach.
+# Tests of single actions without noise, for rules that the published episodes do not cover.
 
 ZERO, ONE = 4, 16  # item bytes of ingredients 0 and 1
 SOUP_0 = 3 * ZERO | COOKED

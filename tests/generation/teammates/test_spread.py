@@ -138,7 +138,7 @@ def test_listed_teammates_differ_by_the_least_distance(layout):
         assert max(returns) - min(returns) >= LEAST_HEADROOM or spread.headroom == 0
 
 
-def test_spread_list_is_a_small_file():
+def test_file_of_spread_teammates_is_small():
     assert SPREAD_TABLE.stat().st_size < 300_000
 
 

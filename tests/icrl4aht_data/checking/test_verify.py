@@ -190,7 +190,7 @@ def test_verify_finds_the_chunk_table_of_another_shard(damaged):
     [
         (lambda lines: lines.reverse(), "line 1: expected history_id 0, since ids count up from 0, found 11"),
         (lambda lines: lines[1].update(env_idx=lines[0]["env_idx"]), "history 1: stream 0 of its task appears twice"),
-        (lambda lines: lines[0].update(layout="test_simple"), "line 1: obs_shape"),
+        (lambda lines: lines[0].update(layout="test_simple"), "line 1: expected obs_shape"),
         (lambda lines: lines[0].update(score=lines[0]["score"] + 1), "history 0: score: the index says"),
         (lambda lines: lines[1].update(seed=77), "history 1: index and task"),
         (lambda lines: lines[2].update(task_id="unknown"), "history 2: its task 'unknown' is missing"),

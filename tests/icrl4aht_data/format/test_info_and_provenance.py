@@ -29,9 +29,9 @@ def test_provenance_keeps_unknown_fields():
 
 
 def test_headroom_of_a_learned_teammate_uses_its_self_play_return():
-    assert not ReferenceEgos(2.0, 4.75, 6.0, 20).has_headroom
+    assert not ReferenceEgos(2.0, 4.75, 6.0, 20).egos_differ
     learned = ReferenceEgos(2.0, 4.75, 6.0, 20, self_play=10.0)
-    assert learned.has_headroom
+    assert learned.egos_differ
     assert learned.describe() == "stay 2.0, random 4.8, oracle 6.0, self-play 10.0"
     for references in (learned, ReferenceEgos(2.0, 4.75, 6.0, 20)):
         made = Provenance(references=references)

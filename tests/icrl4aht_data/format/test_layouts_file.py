@@ -136,10 +136,10 @@ class TestReleaseWithLayouts:
             (lambda lines: [lines[0] | {"map": ["WPWWW", *ROWS[1:3], "WBWWW"]}], "no agent can face a goal"),
             (lambda lines: [lines[0] | {"map": ["WP2W3", *ROWS[1:]]}], "20 cells and piles of 4 ingredient types"),
             (lambda lines: [lines[0] | {"recipes": [[0, 0, 2]]}], r"recipes use ingredients \[2\]"),
-            (lambda lines: [lines[0] | {"name": "mine\x1b[31m"}], "name"),
+            (lambda lines: [lines[0] | {"name": "mine\x1b[31m"}], "printable characters, found 'mine"),
             (
                 lambda lines: [lines[0] | {"map": ["WPWXW", *ROWS[1:3], "WWWBW"], "recipes": [[0, 0, 0]] * 2}],
-                "different",
+                "no recipe twice",
             ),
             (
                 lambda lines: [lines[0] | {"map": ["WPWWW", "0A AW", "W   W", "WBWX1"]}],

@@ -122,7 +122,7 @@ def test_repositories_with_foreign_files_are_refused(hub, published_release, tmp
     (tmp_path / "mine/thesis.txt").write_text("years")
     hub.add_repo(REPO, tmp_path / "mine")
     for dry_run in (True, False):
-        with pytest.raises(UploadError, match=r"has 1 files that belong to no release, such as thesis\.txt"):
+        with pytest.raises(UploadError, match=r"contains 1 file outside any release, such as thesis\.txt"):
             upload_release(published_release, ADDRESS, dry_run=dry_run)
     assert hub.files(REPO) == {"thesis.txt": b"years"}
 

@@ -23,7 +23,7 @@ WRONG_OPTIONS: dict[str, dict[str, Any]] = {
     "every = 0: expected": {"every": 0},
     "process_index = 0, process_count = 4, batch_size = 6": {"batch_size": 6, "process_count": 4},
     "process_index = 3, process_count = 3": {"batch_size": 6, "process_index": 3, "process_count": 3},
-    r"episodes = \(6, 9\): a history of 6 episodes has none": {"episodes": (6, 9)},
+    r"episodes = \(6, 9\): a history with 6 episodes has no episode in this range": {"episodes": (6, 9)},
     r"episodes = \(0, 1, 2\): expected a pair": {"episodes": (0, 1, 2)},
     r"episodes = \(0, 1\.5\): expected a pair": {"episodes": (0, 1.5)},
     r"episodes = \(True, 3\): expected a pair": {"episodes": (True, 3)},
@@ -54,7 +54,9 @@ WRONG_CALLS: dict[str, Any] = {
     "layout = 5: expected": lambda ds: render_observations({"layout": 5, "state": []}),
     "split = {'train': 1}: expected a name": lambda ds: ds.filter(split={"train": 1}),
     "position True of the selection's histories: expected an integer": lambda ds: ds[True],
-    "spans layouts coord_simple, demo_wide.*layout='coord_simple'": lambda ds: load_icrl4aht(ds.root).ad(**SIZES),
+    'the selection has layouts coord_simple, demo_wide.*channels="canonical"': lambda ds: load_icrl4aht(ds.root).ad(
+        **SIZES
+    ),
     "batch = -1: expected": lambda ds: ds.ad(**SIZES)[-1],
     r"batch = 0\.7: expected": lambda ds: ds.ad(**SIZES)[0.7],
     "batch = True": lambda ds: ds.ad(**SIZES)[True],

@@ -69,7 +69,7 @@ class TestObservations:
     @pytest.mark.parametrize("obs", ["float32", "uint8"])
     @pytest.mark.parametrize("channels", ["own", "canonical"])
     def test_rendered_observations_equal_those_of_the_histories(self, built_release, dataset, channels, obs):
-        """Render single rows of lists, and batches of arrays."""
+        """Render an episode from a single row of Python lists, and several from a batch of arrays."""
         opened = dataset.filter(split="train").with_options(obs=obs, channels=channels)
         for layout in opened.layouts:
             expected = [episode.obs for history in opened.filter(layout=layout.name) for episode in history.episodes]

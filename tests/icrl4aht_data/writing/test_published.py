@@ -55,7 +55,7 @@ def test_family_names_of_the_published_code_are_converted(published_folder, tmp_
 
 @pytest.fixture(scope="module")
 def short_views(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]], np.ndarray]:
-    """Return files with 4 x 5 views of cramped_up, their histories, and the complete views (read-only)."""
+    """Return files with observations of 4 x 5 cells of cramped_up, the histories, and the complete observations."""
     folder = tmp_path_factory.mktemp("short")
     written = random_release(folder / "release", layouts=("cramped_up",), teammates=1, streams=2)
     dataset = load_icrl4aht(folder / "release", obs="uint8")

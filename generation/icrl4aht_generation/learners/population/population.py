@@ -78,7 +78,7 @@ class Assignment(NamedTuple):
 
 
 class Algorithm:
-    """Base class of the population algorithms, with `memory` as a pytree of their state, such as multipliers."""
+    """Base class of population algorithms; `memory` is a pytree with an algorithm's own state, such as multipliers."""
 
     def assignment(self, environments: int) -> Assignment:
         """Return the assignment of policies to agents, with a given number of environments for each member."""

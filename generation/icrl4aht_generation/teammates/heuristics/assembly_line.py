@@ -15,8 +15,8 @@ from icrl4aht_generation.teammates.heuristics.heuristic import (
     Heuristic,
     Sampling,
     draw,
-    extra_split,
     parameters,
+    split_key_again,
 )
 
 RUNNER, PLATER, FLEX = range(3)
@@ -130,12 +130,12 @@ def _step_aside(scene: Scene) -> Int[Array, ""]:
 def _with_mistakes(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], u: Array, key: Key[Array, ""]):
     """Return the action, perhaps replaced by a wrong move or a step to the home cell, and the next random key."""
     errs = slips & (u < params["wrong_action_prob"])
-    key, own = extra_split(key, errs)
+    key, own = split_key_again(key, errs)
     wrong = jax.random.bits(jax.random.split(own)[1]) & 3
     action = jnp.where(errs, jnp.asarray(_MOVES_BY_DRAW)[wrong.astype(jnp.int32)], action)
 
     may_return = slips & scene.holds_nothing & (params["stubbornness"] > 0)
-    key, own = extra_split(key, may_return)
+    key, own = split_key_again(key, may_return)
     width, height = jnp.asarray(scene.tables.size)
     # This is the published formula of the home cell; if the cell is a wall, the teammate never walks home.
     home = (3 * scene.slot % height) * width + 5 * scene.slot % width

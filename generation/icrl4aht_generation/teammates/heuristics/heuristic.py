@@ -146,18 +146,18 @@ def _policy_functions(heuristic: Heuristic, slot: int, noise: Noise, mixed: bool
 
 
 def next_key(key: Key[Array, ""]) -> Key[Array, ""]:
-    """Return the next key of a teammate's chain of random keys."""
+    """Return the next random key of a teammate."""
     return jax.random.split(key)[0]
 
 
 def draw(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, " 4"]]:
-    """Return the next key of a teammate's chain, and four uniform random numbers u1..u4, float32 in [0, 1)."""
-    # As in the published code, the first of five keys continues the chain; golden actions depend on this.
+    """Return a teammate's next random key, and four uniform random numbers u1..u4, float32 in [0, 1)."""
+    # As in the published code, the first of five keys is the next one; golden actions depend on this.
     keys = jax.random.split(key, 5)
     return keys[0], jax.vmap(jax.random.uniform)(keys[1:])
 
 
-def extra_split(key: Key[Array, ""], where: Bool[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""]]:
-    """Return the next key of the chain, split once more if `where` is true, and a key for additional random draws."""
+def split_key_again(key: Key[Array, ""], where: Bool[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""]]:
+    """Return a teammate's next random key, split once more if `where` is true, and a key for additional draws."""
     following, own = jax.random.split(key)
     return jnp.where(where, following, key), own

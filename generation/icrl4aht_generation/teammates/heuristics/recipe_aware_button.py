@@ -17,8 +17,8 @@ from icrl4aht_generation.teammates.heuristics.heuristic import (
     Heuristic,
     Sampling,
     draw,
-    extra_split,
     parameters,
+    split_key_again,
 )
 
 _CRAMPED_CELLS = 8
@@ -56,7 +56,7 @@ def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple
     action, considered, pressed, erred = _choose_action(scene, params, recipe, unsure, u)
     # As in the published code, the key does not change if the button is considered but not pressed.
     key = jnp.where(considered & ~pressed & ~idles, memory.key, following)
-    key, _ = extra_split(key, erred & ~idles)
+    key, _ = split_key_again(key, erred & ~idles)
     action = jnp.where(idles, STAY, action)
     return action, ButtonMemory(key, memory.clock + 1, recipe, seen)
 
