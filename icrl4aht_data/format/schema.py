@@ -110,7 +110,7 @@ class Field:
         return np.dtype(("u1", (record_size(layout),) if self.row == "state" else layout.obs_shape))
 
     def memory_dtype(self, layout: Layout) -> np.dtype:
-        """Return the dtype in which samplers keep an element in memory: the compact one, whatever the kind of release."""
+        """Return the dtype in which samplers keep an element in memory: the compact one for every kind of release."""
         return self.element(layout, "lite")
 
 

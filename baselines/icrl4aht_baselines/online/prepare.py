@@ -212,8 +212,8 @@ def _heuristic_teammates(teammates: _Teammates) -> dict[Layout, dict[str, dict[s
     for layout, _ in teammates:
         if layout.recipes != get_layout(layout.name).recipes:
             raise OptionError(
-                f"{layout.name} has tasks with a fixed dish, and --rearranged and --four-recipes change the dishes; leave "
-                f"out these options, or select other tasks"
+                f"{layout.name} has tasks with a fixed dish, and --rearranged and --four-recipes change the dishes; "
+                f"leave out these options, or select other tasks"
             )
     found: dict[Layout, dict[str, dict[str, Policy]]] = {layout: {} for layout, _ in teammates}
     for (layout, kind), mates in teammates.items():
