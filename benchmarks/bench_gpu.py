@@ -150,7 +150,7 @@ def product_tflops(size: int, dtype: str, precision: str | None, seconds: float)
 
 
 def describe_device(sizes: Sizes) -> dict[str, Any]:
-    """Return facts about machine, software and settings."""
+    """Return a description of the machine, the software and the settings."""
     devices = jax.devices()
     root = Path(__file__).resolve().parent
     commit = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
@@ -215,7 +215,7 @@ def measure_training(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) 
                 raise
             reason = str(error)
         parts *= 2  # not in the except block, where the arrays of the failed attempt are still in memory
-    raise MemoryError(f"no number of parts fits: {reason}")
+    raise MemoryError(f"the batch does not fit in any number of parts: {reason}")
 
 
 def _training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, parts: int) -> dict[str, Any]:
@@ -435,7 +435,7 @@ def main(
 
 def child_environment() -> dict[str, str]:
     """Return the environment variables of child processes, which let JAX use 92 % of the GPU memory."""
-    names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")  # JAX accepts only one of both
+    names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")  # JAX accepts only one
     return {**os.environ, **({} if any(name in os.environ for name in names) else {names[0]: "0.92"})}
 
 

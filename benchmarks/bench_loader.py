@@ -132,7 +132,7 @@ def batch_seconds(sampler: ADSampler, buffer: ADBatch | None, cache: str, first:
 
 
 def compare_readers(folder: Path, batch: int, length: int, rounds: int, threads: int, peer_windows: int) -> None:
-    """Compare our samplers, with each cache and form of observations, with both peers."""
+    """Compare our samplers to both peers, for each cache and form of observations."""
     dataset: Any = load_icrl4aht(folder / "lite", threads=threads)
     windows_of = dataset.ad(batch_size=batch, length=length, seed=1).windows
     peers = {

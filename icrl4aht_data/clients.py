@@ -26,7 +26,7 @@ THREADS = 8
 
 _TIMEOUT = 15.0  # maximum seconds to connect, and to wait for the next bytes of a response
 _WAITS = (1.0, 2.0, 4.0)  # seconds before a request is repeated after a transient error
-_TRANSIENT_STATUS = (408, 429)  # HTTP statuses to retry, in addition to all from 500
+_TRANSIENT_STATUS = (408, 429)  # HTTP statuses to retry, besides 500 and above
 _PERMANENT = (FileNotFoundError, PermissionError, ImportError, NotImplementedError, TypeError, ValueError)
 _ADDRESS = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*://)(?:[^/\s'\"<>]*@)?(?P<rest>[^\s?#'\"<>]*)[^\s'\"<>]*")
 
@@ -50,7 +50,7 @@ def check_credentials(address: str) -> None:
     """
     try:
         parts = urlsplit(address)
-        # "s3://user:12/3@host" would be parsed as host "user" with port 12: refused, unless the host has a dot.
+        # "s3://user:12/3@host" would be parsed as host "user", port 12. Only a host with a dot may precede such a path.
         is_clear = parts.port is None or "@" in parts.netloc or "@" not in parts.path or "." in parts.netloc
     except ValueError:  # raised if the port is not a number
         is_clear = False
@@ -76,16 +76,16 @@ class HubClient:
     def connect(self) -> Iterator[None]:
         """Return a context in which requests fail after `_TIMEOUT` seconds without a response, even if retried.
 
-        Two hooks set this limit: by itself, huggingface_hub waits for some responses forever and for others five times
-        60 s.
+        Two hooks set this limit, because without it huggingface_hub waits forever for some responses, and five times
+        60 s for others.
         """
         from huggingface_hub import get_session
 
         unanswered: dict[str, float] = {}
 
         def before_request(request: Any) -> None:
-            # The time counts per address, as a server may answer only other requests, and per host, as the client
-            # sends further requests by itself.
+            # Time is measured per address, since a server may answer some addresses only, and per host, since the
+            # client sends requests to further addresses of a host by itself.
             now, keys = time.monotonic(), (str(request.url), request.url.host)
             first = min(unanswered.setdefault(key, now) for key in keys)
             left = first + _TIMEOUT - now

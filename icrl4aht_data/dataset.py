@@ -73,7 +73,7 @@ def load_icrl4aht(
         split: "train", "validation", "test" or "heldout". Each filter is one value, a sequence of values, or None
             for any value. Train models on "train" only; samplers warn about a mixture of splits.
         layout: a short name (coord_simple) or an environment name (grounded_coord_simple).
-        layout_family: "published", or a family of layouts that the release carries, such as "templates".
+        layout_family: "published", or a family of layouts that the release stores, such as "templates".
         track: "teammate" or "layout": which of the two is new in the test tasks.
         teammate_family: "rl" (learned) or "H1".."H4" (heuristics).
         teammate_kind: an algorithm or a heuristic, such as "fcp" or "utility_greedy".

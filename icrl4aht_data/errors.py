@@ -131,7 +131,7 @@ class TaskFormatError(Icrl4ahtError, ValueError):
 
 
 class WeakLabelsWarning(UserWarning):
-    """The policy behind some tasks' labels earns less than half of the ego's return at the end of their histories."""
+    """The policy behind some tasks' labels earns less than half of what the ego earns at the end of the histories."""
 
 
 class MixedSplitsWarning(UserWarning):
@@ -148,7 +148,7 @@ def check_choice(what: str, found: object, valid: Iterable[str]) -> None:
         raise unknown(what, found, valid)
 
 
-_LISTED, _COMPARED = 50, 1000  # most valid names that a message lists, and most that are compared with the wrong one
+_LISTED, _COMPARED = 50, 1000  # maximum number of valid names to list, and to compare with the wrong one
 
 
 def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:

@@ -66,7 +66,7 @@ class ReleaseLocation:
         """Return the path of a file of the release; the file need not exist.
 
         Raises:
-            UnsafePathError: if the path leads out of the release.
+            UnsafePathError: if the path points outside the release.
         """
         return disk.resolve_inside(self.folder, name)
 
@@ -77,7 +77,7 @@ class ReleaseLocation:
         """Return the path of a file, downloaded if necessary; local files in meta/ are checked against the manifest.
 
         Raises:
-            UnsafePathError: if the path leads out of the release.
+            UnsafePathError: if the path points outside the release.
             RemoteError, OfflineError: if the file cannot be downloaded.
             IndexFormatError, ChunkTableError: if the file does not match the manifest.
         """
@@ -89,7 +89,7 @@ class ReleaseLocation:
         """Download and check the files of a folder, which need not exist, and return the path of the folder.
 
         Raises:
-            UnsafePathError: if the path leads out of the release.
+            UnsafePathError: if the path points outside the release.
             RemoteError, OfflineError: if a file cannot be downloaded.
             IndexFormatError: if a file does not match the manifest.
         """
@@ -123,7 +123,7 @@ class Remote(ReleaseLocation):
         return self.url
 
     def file(self, name: str) -> Path:
-        self.fetch([name])  # checks the file's hash
+        self.fetch([name])  # also checks the hash
         return self.path(name)
 
     def fetch(self, names: Iterable[str], advance: Advance | None = None, again: bool = False) -> None:
@@ -136,7 +136,7 @@ class Remote(ReleaseLocation):
             again: also download files that are already present.
 
         Raises:
-            OfflineError: if network access is switched off; names every missing file.
+            OfflineError: if network access is switched off; the message names every missing file.
             RemoteError: if a file cannot be downloaded, or does not match the manifest.
         """
         wanted = list(dict.fromkeys(names))
@@ -171,7 +171,7 @@ class Remote(ReleaseLocation):
         """Download a file, and move it to its final path if its hash is the one in the manifest."""
         address, target = f"{self.url}/{name}", self.path(name)
         if scratch is None:
-            _remove_from_cache(target)  # otherwise the client would return a changed file
+            _remove_from_cache(target)  # so that the client downloads the file
         most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else disk.LARGEST
         path = _fetch_with_retries(self.client, address, name, scratch, advance, most)
         size, found = path.stat().st_size, disk.file_hash(path)
@@ -203,7 +203,7 @@ class Remote(ReleaseLocation):
         return is_hashable and disk.file_hash(path) == self.manifest[name]
 
     def sizes(self, names: Iterable[str]) -> dict[str, int]:
-        """Return file -> size in bytes, as the remote reports; 0 if no size is reported.
+        """Return the size in bytes of each file, as reported by the remote; 0 for an unreported size.
 
         Raises:
             RemoteError: if the remote cannot be reached, or does not have a file.
@@ -237,7 +237,7 @@ def _fetch_with_retries(
         return client.get(name, scratch, count)
 
     path = with_retries(address, attempt)
-    advance(path.stat().st_size - arrived)  # bytes that the Hub's cache had under another name
+    advance(path.stat().st_size - arrived)  # the Hub's cache may already have the bytes
     return path
 
 
@@ -248,7 +248,7 @@ def _remove_from_cache(path: Path) -> None:
 
 
 def check_root(root: Any) -> None:
-    """Check that a root is a path, or a text without null characters.
+    """Check that a root is a path, or a string without null characters.
 
     Raises:
         OptionError: for any other value.
@@ -306,7 +306,7 @@ def _open_address(address: str, to: Path | None) -> Remote:
     check_credentials(address)
     client, url = FsspecClient(address), without_credentials(address).rstrip("/")
     base = data_folder() / f"{re.sub(r'[^A-Za-z0-9.]+', '-', url)[:80]}-{disk.short_hash(url.encode(), 8)}"
-    latest = base / "latest"  # names the version that the address had when it was last opened
+    latest = base / "latest"  # contains the version found when the address was last opened
     if offline_switches():
         path = (to or base / (latest.read_text() if latest.is_file() else "none")) / MANIFEST
         if not path.is_file():
@@ -362,7 +362,7 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
         if has_manifest():
             return
         if path.exists() and not is_ours:
-            raise OptionError(f"{folder}: contains another release or version than {url} now; give another folder")
+            raise OptionError(f"{folder}: contains a release that differs from {url}; give another folder")
         if folder.exists() and any(folder.iterdir()) and not is_ours:
             raise OptionError(f"{folder}: not empty, and not a release; give a new or an empty folder")
         folder.mkdir(parents=True, exist_ok=True)
@@ -417,7 +417,7 @@ def plan_download(
     Raises:
         OptionError: if `url` is not an address, or `to` contains other files.
         RemoteError, OfflineError: if the index cannot be downloaded.
-        EmptySelectionError, UnknownNameError: if no history matches the filters, or a filter has no such value.
+        EmptySelectionError, UnknownNameError: if no history matches the filters, or a filter's value does not exist.
     """
     remote = open_remote(url, to)
     index, names = read_index(remote.folder), sorted(chosen_files(remote, **wanted))

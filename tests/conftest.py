@@ -38,7 +38,7 @@ SharedFolder = Callable[[str, Callable[[Path], object]], Path]
 COMPILATION_CACHE: dict[str, Any] = {
     "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".cache" / "jax"),
     "jax_compilation_cache_max_size": 2 * 2**30,  # JAX locks a folder with a size limit; processes can then share it
-    "jax_persistent_cache_min_compile_time_secs": 0.1,  # takes a third less CPU time than 0.5 with a warm cache
+    "jax_persistent_cache_min_compile_time_secs": 0.1,  # warm runs take a third less CPU time than with 0.5
 }
 COSTLIEST = """
 collect notebooks wheel reference generate run heuristics scripted suite fetch gymnasium_env rl2 docs models trainer
@@ -63,7 +63,7 @@ def pytest_configure() -> None:
             os.environ["XLA_FLAGS"] = add_xla_flag(QUICK_COMPILATION)
     os.environ.setdefault("JAX_PLATFORMS", "cpu")  # tests expect a CPU's bits and tolerances
     jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
-    os.environ.setdefault("PJRT_NPROC", "1")  # one thread, as in the test profiles; must be set before JAX starts
+    os.environ.setdefault("PJRT_NPROC", "1")  # must be set before JAX starts; test profiles use one thread
     jax.monitoring.register_event_duration_secs_listener(_count_compilation)
     for name, value in COMPILATION_CACHE.items():
         jax.config.update(name, value)
@@ -78,7 +78,7 @@ def _count_compilation(event: str, duration_secs: float, **kwargs: Any) -> None:
 
 
 def _remove_unfinished_entries(folder: Path) -> None:
-    """Remove cache entries that killed processes left without an access-time file; JAX fails to add more otherwise."""
+    """Remove cache entries without an access-time file, left by killed processes; with them JAX fails to add more."""
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / ".lockfile"):
         for entry in folder.glob("*-cache"):

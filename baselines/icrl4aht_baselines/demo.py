@@ -36,7 +36,7 @@ from icrl4aht_data.utils.progress import progress_bars
 
 DEMO_LAYOUT = "rooms-0-46"
 _SOURCE = "search"
-_EPISODES = 5  # episodes of a window; the script that made the histories finds out the dish within them
+_EPISODES = 5  # episodes of a window, in which the script of the histories finds out the dish
 
 _MODEL = ModelOptions(
     width=128, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05
@@ -168,7 +168,7 @@ def _played_blocks(run: EvaluationRun) -> list[str]:
     return [block for block in EPISODE_BLOCKS if all(block in of.blocks for of in run.returns.values())]
 
 
-def find_gain(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInterval:
+def mean_gain(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInterval:
     """Return a run's return in its last block of episodes minus that in its first episode, or minus another run's.
 
     Differences are paired by task and seed. Each combination of layout and teammate family has the same weight.
@@ -186,13 +186,13 @@ def find_gain(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInt
 
 def conclusion(own: EvaluationRun, cleared: EvaluationRun) -> str:
     """Return text that says whether the model learns within its context, and how far the measurement can be trusted."""
-    rise, memory = find_gain(own), find_gain(own, cleared)
+    rise, memory = mean_gain(own), mean_gain(own, cleared)
     verdict = "rises by what it remembers" if rise.low > 0 and memory.low > 0 else "does not rise by what it remembers"
     return (
         f"Its return {verdict}: {rise.text(sign='+')} from the first episode to the last ones, {memory.text(sign='+')} "
         f"more there than with its memory cleared before each episode.\n"
-        f"It is one training: the intervals leave out how much trainings differ. Validation tasks are for choosing "
-        f"models, so this is no test result."
+        f"This is one training run, and the intervals leave out how much such runs differ. Validation tasks are for "
+        f"choosing models, so this is no test result."
     )
 
 

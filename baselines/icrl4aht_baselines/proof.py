@@ -1,6 +1,6 @@
-"""Proof that a release teaches: models trained on its histories alone, and their returns on validation tasks.
+"""Proof that models learn from a release: training on its histories alone, and returns on validation tasks.
 
-    OUT/SOURCE-LEARNER-sSEED/run         run folder of a training
+    OUT/SOURCE-LEARNER-sSEED/run         run folder of a training job
     OUT/SOURCE-LEARNER-sSEED/results     results on the sets of validation tasks, with memory and without
     OUT/references/...                   results of egos to compare with
     OUT/proof.json                       summary of all results, which the card of the release shows
@@ -74,11 +74,11 @@ _TRAINING: dict[str, Any] = {"learning_rate": 2e-3, "validate_every": 10**6, "sa
 
 @dataclass(frozen=True)
 class ProofOptions:
-    """Settings that all trainings of the proof share.
+    """Settings that all training jobs of the proof share.
 
     Attributes:
         root: folder or address of a release; None for the bundled release.
-        steps: number of training steps; with the defaults, a training takes about 35 minutes on a core.
+        steps: number of training steps; with the defaults, a job takes about 35 minutes on a core.
         batch_size: number of windows or contexts in a batch.
         context: K, steps of a window or transitions of a context.
         tasks: set of tasks -> its tasks; by default validation tasks, see `task_sets`.
@@ -92,7 +92,7 @@ class ProofOptions:
 
     @property
     def task_sets(self) -> dict[str, tuple[Task, ...]]:
-        """Set of tasks -> its tasks; by default validation tasks of two tracks, without those that have no headroom."""
+        """Name of a set -> its tasks; by default the validation tasks of two tracks that have headroom."""
         if self.tasks is not None:
             return self.tasks
         played = [*bundled_tasks(TEAMMATE_TRACK, "validation"), *bundled_tasks(TEAMMATE_TRACK, "diverse")]
@@ -109,9 +109,9 @@ class ProofJob:
     Attributes:
         source: source of the histories, or "all".
         learner: a name in `LEARNERS`.
-        seed: seed of the training.
-        options: settings that all trainings share.
-        out: folder of all trainings.
+        seed: seed of the training run.
+        options: settings that all jobs share.
+        out: folder of all jobs.
         xla_threads: number of XLA threads on a CPU.
     """
 
@@ -145,7 +145,7 @@ class ProofJob:
 
     @property
     def training(self) -> TrainOptions:
-        """Settings of this training, for the trainer."""
+        """Settings of this training run, for the trainer."""
         own = self.options
         return TrainOptions(own.steps, own.batch_size, own.context, seed=self.seed, **_TRAINING)
 
@@ -169,7 +169,7 @@ class ProofJob:
         return parse_json(read_text(self.result_file))
 
     def progress(self) -> tuple[int, float] | None:
-        """Return the number of finished training steps, and history steps per second; None before the first log."""
+        """Return the finished training steps and the history steps per second; None before the first log line."""
         timing = last_line(self.folder / "run" / TIMING)
         if not timing:
             return None
@@ -201,7 +201,7 @@ class ProofJob:
 
 
 def _training_seconds(timing: Path) -> float:
-    """Return the duration of a training in seconds, from its timing log, which also covers resumed parts."""
+    """Return the duration of a training run in seconds, from its timing log, which also covers resumed parts."""
     lines = [parse_json(line) for line in read_text(timing).splitlines()]
     steps = np.diff([0, *(line["step"] for line in lines)])
     return float(np.sum(steps / [line["steps_per_second"] for line in lines]))
@@ -231,10 +231,10 @@ def play_sets(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool 
 
 
 def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[str, float]]], path: Path) -> Path:
-    """Write the returns of finished trainings: an entry for each source and learner, with a value for each training.
+    """Write the returns of finished jobs: an entry for each source and learner, with a value for each training seed.
 
     Args:
-        jobs: jobs of the trainings; unfinished ones are skipped.
+        jobs: training jobs; unfinished jobs are skipped.
         references: name of an ego -> returns from `play_sets`.
         path: path of the file, which is replaced.
     """

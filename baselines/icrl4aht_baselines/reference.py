@@ -5,7 +5,7 @@
     OUT/agent-TRACK             histories of RL^2 with falling noise, source `agent`
     OUT/rising-TRACK            histories of RL^2 that begin with random actions, see `RL2_HISTORIES`
     OUT/NAME-TRACK              run folder of the model NAME
-    OUT/NAME-TRACK-first        run folder of the first training of a model with two trainings
+    OUT/NAME-TRACK-first        run folder of the first of two training runs of a model
     OUT/NAME-TRACK-own          histories that this first model plays, labelled by RL^2
     OUT/NAME-TRACK-mixed        the histories of the first training together with the model's histories
     OUT/results/NAME-TRACK/...  results on validation tasks and on test tasks
@@ -94,7 +94,7 @@ class Recipe:
         model: values of `ModelOptions`.
         train: values of `TrainOptions`.
         histories: values of `HistoryOptions`.
-        own_round: whether a second training follows, on the first histories and on histories that the model itself
+        own_round: whether a second training run follows, on the first histories and on histories that the model itself
             plays and RL^2 labels.
         greedy: whether the model takes its most probable actions or samples its actions.
         role: purpose of the model in the package.
@@ -112,7 +112,7 @@ class Recipe:
 
 _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
 _STEPS: dict[str, Any] = {"steps": 4000, "batch_size": 16, "context": 200, "learning_rate": 2e-3}
-# With K + 1 queries, each prefix of a context of K transitions has a different one.
+# With K + 1 queries, each prefix of a context of K transitions has its own query.
 _QUERIES: dict[str, Any] = {"labels": "expert", "queries": _STEPS["context"] + 1}
 _LONG: dict[str, Any] = {**_STEPS, "steps": 3000, "batch_size": 4, "context": 1000}
 
@@ -168,7 +168,7 @@ def make_reference(
 
     Raises:
         OptionError: if a run folder holds a run with other settings. Existing releases are not checked.
-        TrainingStopped: after SIGTERM or SIGINT during a training, which is saved.
+        TrainingStopped: after SIGTERM or SIGINT during training, whose state is saved.
     """
     steps, recipe = _ReferenceSteps(out, track, show, teacher), RECIPES[name]
     run = out / f"{name}-{track}"
@@ -192,7 +192,7 @@ def check_learns_from_teacher(name: str) -> None:
     """
     if not RECIPES[name].data:
         taught = ", ".join(each for each, recipe in RECIPES.items() if recipe.data)
-        raise OptionError(f"{name} learns from no histories of a teacher; leave it out, or choose one of {taught}")
+        raise OptionError(f"{name} does not learn from a teacher's histories; leave it out, or choose one of {taught}")
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ class _ReferenceSteps:
         return read_tasks(manifest_path(self.track, "train", "diverse"))
 
     def train_by_playing(self) -> Path:
-        """Train RL^2 by playing with the teammates of the noise histories and diverse ones. Return the run folder."""
+        """Train RL^2 by playing with teammates of the noise histories and diverse teammates. Return the run folder."""
         recipe, folder = RECIPES["rl2-reference"], self.out / f"rl2-reference-{self.track}"
         options = TrainOptions(**recipe.train)
         root = str(self.noise_release())
@@ -247,7 +247,7 @@ class _ReferenceSteps:
         return folder
 
     def train(self, recipe: Recipe, root: Path, folder: Path, before: Path | None = None) -> None:
-        """Train a model on a release; with `before`, start from that run at a lower learning rate."""
+        """Train a model on a release, from the parameters of the run `before` at a lower learning rate if given."""
         options = TrainOptions(**recipe.train)
         if before:
             options = replace(options, learning_rate=OWN_SHARE * options.learning_rate)
@@ -258,7 +258,7 @@ class _ReferenceSteps:
         job.train(folder, params=params, done=show_steps(self.show, folder.name, options.steps))
 
     def add_own_histories(self, histories: Path, first: Path, run: Path) -> Path:
-        """Record histories of a model, labelled by the teacher. Return a release of them and the given histories."""
+        """Record histories of a model, labelled by the teacher. Return a release of these and the given histories."""
         own, mixed = (run.with_name(f"{run.name}-{kind}") for kind in ("own", "mixed"))
         if not mixed.is_dir():
             if not own.is_dir():

@@ -38,7 +38,7 @@ from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS,
 from icrl4aht_generation.learners.config import EncoderKind
 
 if TYPE_CHECKING:
-    from icrl4aht_generation.profiles import Profile  # not at run time, because the module imports JAX
+    from icrl4aht_generation.profiles import Profile  # only for type checkers, because the module imports JAX
 
 console = Console(soft_wrap=True)
 
@@ -139,11 +139,11 @@ def _profile_with_threads(name: str, threads: int | None) -> Profile:
     from icrl4aht_generation.learners.resume import limit_xla_threads
     from icrl4aht_generation.profiles import load_profile
 
-    def limit(profile: Profile) -> None:
+    def limit_threads(profile: Profile) -> None:
         if threads or profile.xla_threads:
             limit_xla_threads(threads or profile.xla_threads or 1)
 
-    profile = load_profile(name, limit)
+    profile = load_profile(name, limit_threads)
     return replace(profile, xla_threads=threads) if threads else profile
 
 
@@ -281,7 +281,7 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
             different = read_tasks(path) != tasks
             if different and (check or not overwrite):
                 remedy = "run `icrl4aht-data research manifests --overwrite`" if check else "replace it by --overwrite"
-                raise TaskFormatError(f"{path}: the file has other tasks than this version writes; {remedy}")
+                raise TaskFormatError(f"{path}: the file's tasks differ from the tasks of this version; {remedy}")
         if not check:
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(path) as partial:

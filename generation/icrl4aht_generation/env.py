@@ -110,7 +110,7 @@ class Environment:
 
     @property
     def recipe_items(self) -> np.ndarray:
-        """Items of the recipes that the environment draws from, uint8 (R,)."""
+        """Items of all recipes that the environment may draw, uint8 (R,)."""
         return self.tables.recipes
 
     def init(self, keys: Key[Array, " N"], layout: Int[Array, " N"] | None = None) -> EnvState:
@@ -127,7 +127,7 @@ class Environment:
         if np.ndim(self.tables.kinds) == 1:
             layout = None
         elif self.redraws:
-            layout = self._drawn_layout(keys, zero)
+            layout = self._random_layout(keys, zero)
         elif layout is None:
             layout = jnp.arange(len(keys)) % len(self.tables.kinds)
         return EnvState(keys, zero, zero, self.first_record(keys, zero, layout), layout)
@@ -144,7 +144,7 @@ class Environment:
         def restarted() -> tuple[Array, Array | None]:
             layout = state.layout
             if self.redraws and layout is not None:
-                layout = jnp.where(done, self._drawn_layout(state.key, episode), layout)
+                layout = jnp.where(done, self._random_layout(state.key, episode), layout)
             first = self.first_record(state.key, episode, layout)
             return jnp.where(done[:, None], first, outcome.state), layout
 
@@ -185,7 +185,7 @@ class Environment:
 
         Args:
             policy: policy that chooses the actions.
-            params: parameters of the policy; with `own`, stacked on a leading axis of length N.
+            params: parameters of the policy, stacked on a leading axis of length N if `own` is true.
             memories: memories of the policy, with leaves (N, ...).
             state: the environments' states.
             agent: 0 for the ego, 1 for the teammate.
@@ -220,7 +220,7 @@ class Environment:
     def next_recipe(self, state: EnvState) -> UInt8[Array, " N"]:
         """Return the item of the recipe that becomes current if this step makes a correct delivery."""
         keys = _fold(self.episode_key(state), state.clock + 1)
-        return self.on_tables(_drawn_recipe, state.layout, keys)
+        return self.on_tables(_random_recipe, state.layout, keys)
 
     def episode_key(self, state: EnvState) -> Key[Array, " N"]:
         """Return the key of each running episode, which depends only on the environment's key and the episode's number.
@@ -241,7 +241,7 @@ class Environment:
         draw = jax.vmap(lambda key: jax.random.split(key, 5))(_fold(_fold(keys, episode), jnp.zeros_like(episode)))
         return self.on_tables(_first_record, layout, draw)
 
-    def _drawn_layout(self, keys: Key[Array, " N"], episode: Int[Array, " N"]) -> Int[Array, " N"]:
+    def _random_layout(self, keys: Key[Array, " N"], episode: Int[Array, " N"]) -> Int[Array, " N"]:
         """Return a random layout number for the given episode of each environment."""
         return _random_below(
             _fold(_fold(keys, episode), jnp.full_like(episode, _LAYOUT_DRAW)), np.uint32(len(self.tables.kinds))
@@ -254,17 +254,17 @@ _LAYOUT_DRAW = 2**31 - 1
 
 def _first_record(tables: Tables, draw: Key[Array, "*N 5"]) -> UInt8[Array, "*N S"]:
     (ego_room, mate_room), (ego_cells, mate_cells) = jnp.asarray(tables.rooms), jnp.asarray(tables.room_sizes)
-    # In a shared room the teammate has one cell less to start on, and skips the ego's cell.
+    # In a shared room the teammate cannot start on the ego's cell, so its number skips that cell.
     one_room = jnp.all(ego_room == mate_room) & (ego_cells == mate_cells)
     ego_number = _random_below(draw[..., 0], ego_cells)
     mate_number = _random_below(draw[..., 1], mate_cells - one_room)
     mate_number += one_room & (mate_number >= ego_number)
     positions = jnp.stack([ego_room[ego_number], mate_room[mate_number]], axis=-1)
     facings = jnp.stack([_random_below(draw[..., k], np.uint32(4)) for k in (2, 3)], axis=-1).astype(jnp.uint8)
-    return start_record(tables, positions, facings, _drawn_recipe(tables, draw[..., 4]))
+    return start_record(tables, positions, facings, _random_recipe(tables, draw[..., 4]))
 
 
-def _drawn_recipe(tables: Tables, keys: Key[Array, "*N"]) -> UInt8[Array, "*N"]:
+def _random_recipe(tables: Tables, keys: Key[Array, "*N"]) -> UInt8[Array, "*N"]:
     return jnp.asarray(tables.recipes)[_random_below(keys, jnp.asarray(tables.recipe_count))]
 
 

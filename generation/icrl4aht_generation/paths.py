@@ -212,12 +212,12 @@ class Scene:
 
     @cached_property
     def needed(self) -> Int[Array, " 3"]:
-        """Number of missing pieces of each piled ingredient, over all pots together."""
+        """Number of pieces of each ingredient that the recipe still needs, given the contents of all pots together."""
         # As in the published code, the contents of all pots are added: two half-filled pots count as one.
         return jnp.maximum(self.counts(self.state.recipe) - self.counts(self.state.pot_items).sum(axis=0), 0)
 
     def counts(self, item: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
-        """Return the number of pieces of each piled ingredient in an item, by ascending id; 0 for further types."""
+        """Return an item's number of pieces of each ingredient of the layout, by ascending id, filled up with 0."""
         # An item byte has two bits for each ingredient, above the bits of plate and cooked.
         shift = 2 + 2 * jnp.arange(3, dtype=jnp.uint8)
         return (item[..., None] >> shift & 3).astype(jnp.int32)
@@ -349,11 +349,11 @@ class Scene:
 
     @cached_property
     def free(self) -> Bool[Array, " 4"]:
-        """Mask of the `ways` that lead onto a floor cell without the partner."""
+        """Whether the move right, down, left or up is possible, as neither the map nor the partner blocks it."""
         return (self.ways != self.me) & (self.ways != self.partner)
 
     def sidestep(self, otherwise: Int[Array, ""] | int) -> Int[Array, ""]:
-        """Return the first free move in the order right, down, left, up; `otherwise` if no move is free."""
+        """Return the first free move in the order right, down, left, up, or `otherwise` if no move is free."""
         return self.best_way(self.free, jnp.zeros(4), otherwise)
 
     def best_way(
@@ -362,12 +362,12 @@ class Scene:
         score: Int[Array, " 4"] | Float[Array, " 4"],
         otherwise: Int[Array, ""] | int = STAY,
     ) -> Int[Array, ""]:
-        """Return the allowed move with the highest score, with ties in the order right, down, left, up."""
+        """Return the allowed move with the highest score; ties are resolved in the order right, down, left, up."""
         best = jnp.argmax(jnp.where(allowed, score, -jnp.inf))
         return jnp.where(jnp.any(allowed), jnp.asarray(SEARCH_ORDER)[best], otherwise)
 
     def wander(self, stay_score: int = 50) -> Int[Array, ""]:
-        """Return a step onto a free neighbour cell; else stay, or walk into the partner if `stay_score` is 150."""
+        """Return a step onto a free neighbour cell, else `stay`, or a push of the partner if `stay_score` > 100."""
         target = jnp.asarray(self.tables.moves)[self.me].astype(jnp.int32)
         # Published costs: pushing the partner costs 100, so a `stay_score` above 100 prefers pushing to staying.
         scores = [jnp.where(target[a] == self.me, 1000, 100 * (target[a] == self.partner)) for a in SEARCH_ORDER]

@@ -55,7 +55,7 @@ class Policy(NamedTuple):
 
     @property
     def label_view(self) -> LabelView:
-        """What labels by this policy are computed from: "state" for the full state, "ego" for what an ego sees."""
+        """What this policy sees when it labels: "state" for the full state, "ego" for the observations of an ego."""
         return "state" if self.sees in ("state", "situation") else "ego"
 
 

@@ -20,17 +20,17 @@ from icrl4aht_data.utils.templates import card_file
 
 
 class TrainedResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One training of an ego with one teammate.
+    """One training run of an ego with one teammate.
 
     Attributes:
-        seed: seed of the training.
-        steps: environment steps of the training.
+        seed: seed of the training run.
+        steps: environment steps of the training run.
         width: number of features and of recurrent units of the ego's network.
         mean_return: mean return per episode of the trained ego; stored as `return` in the file.
-        choice: mean return in the episodes that decide which training is the best.
+        choice: mean return in the episodes that decide which training run is the best.
         acting: "greedy" or "sampled" actions, whichever earned more in the episodes of `choice`.
-        slope: rise of the mean return during the training, from the third to the last quarter of its steps.
-        init: name of the bundled model that the training started from; empty for random parameters.
+        slope: rise of the mean return from the third to the last quarter of the steps of the training run.
+        init: name of the bundled model that the training run started from; empty for random parameters.
     """
 
     seed: int
@@ -51,7 +51,7 @@ class BestResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         family: family of the teammate.
         split: split of the tasks.
         tasks: ids of the tasks whose teammates show this behaviour.
-        seeds: trainings of egos with a teammate of this behaviour.
+        seeds: training runs of egos with a teammate of this behaviour.
         best: highest mean return of any ego that sees only its own observations.
         agent: name of the ego that earns the highest return, such as "best response, seed 1".
     """
@@ -82,7 +82,7 @@ class BestResponseCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def chosen_training(trainings: Iterable[TrainedResponse]) -> TrainedResponse:
-    """Return the training with the highest `choice` return."""
+    """Return the training run with the highest `choice` return."""
     return max(trainings, key=lambda one: -math.inf if one.choice is None else one.choice)
 
 

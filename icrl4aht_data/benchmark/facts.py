@@ -156,7 +156,7 @@ def all_families() -> tuple[str, ...]:
 
 
 def family_order(family: str) -> tuple[int, str]:
-    """Return the sort key of a family: the benchmark's families come first in its order, then others by name."""
+    """Return the sort key of a family: the benchmark's families come first, then other families by name."""
     return (FAMILIES.index(family), "") if family in FAMILIES else (len(FAMILIES), family)
 
 
@@ -175,8 +175,8 @@ def track_layouts(track: str, split: str) -> tuple[str, ...]:
 def track_of(layout: str) -> str:
     """Return the benchmark's track whose layouts include `layout` (short name).
 
-    A published layout without indicators has the track of the published one; the track of generated and registered
-    layouts is "layout".
+    A published layout whose indicators are removed keeps its track; the track of generated and registered layouts is
+    "layout".
 
     Raises:
         UnknownNameError: if no track includes it.
@@ -191,7 +191,7 @@ def track_of(layout: str) -> str:
 
 
 def layout_order(layout: str) -> tuple[int, str]:
-    """Return the sort key of a layout (short name): the benchmark's come first in its order, then others by name."""
+    """Return the sort key of a layout (short name): the benchmark's layouts come first, then others by name."""
     return (LAYOUT_NAMES.index(layout), "") if layout in LAYOUT_NAMES else (len(LAYOUT_NAMES), layout)
 
 

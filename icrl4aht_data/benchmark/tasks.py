@@ -89,7 +89,7 @@ class Task:
 
 @dataclass(frozen=True)
 class NamedTask(Task):
-    """A task known only from index lines, so the teammate's parameters are unknown and the seed is -1.
+    """A task known only from the index of a release: its teammate's parameters are unknown, its seed is -1.
 
     Args:
         teammate: the fields teammate_kind and teammate_family of the index line.

@@ -17,7 +17,7 @@ Drawings = dict[str, dict[str, list]]
 
 
 def shape_to_json(shape: tuple[Any, ...]) -> list[str | float]:
-    """Return a shape of a `Canvas` as a JSON list; colours become texts such as "#2b303a", numbers are rounded."""
+    """Return a shape of a `Canvas` as a JSON list; colours become strings such as "#2b303a", numbers are rounded."""
     return [
         value if isinstance(value, str) else hex_colour(value) if isinstance(value, tuple) else _round_coordinate(value)
         for value in shape

@@ -94,7 +94,7 @@ def spread_episodes(episodes: int, most: int | None) -> np.ndarray:
 
 
 def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
-    """Return a history in the form that a page embeds, with frames of at most `most` episodes; None for all.
+    """Return a history in the form that a page embeds, with frames of at most `most` episodes (None: all).
 
     Raises:
         NotStoredError: if the release has no state records.

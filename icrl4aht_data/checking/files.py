@@ -20,7 +20,7 @@ from icrl4aht_data.utils.files import LARGEST, file_hash, files_below, regular_f
 _HUB_FILES = (".gitattributes", ".cache/huggingface/")
 """Files that the Hugging Face Hub and its client add to a repository."""
 
-_META = re.compile(r"meta/[^/]+")  # hashed at every level, because `load_icrl4aht` checks these files, too
+_META = re.compile(r"meta/[^/]+")  # files that are hashed at every level, as in `load_icrl4aht`
 
 
 def check_files(
@@ -68,7 +68,7 @@ def check_files(
 
 
 def _recorded_sizes(root: Path, listed: Mapping[str, str]) -> dict[str, int]:
-    """Return shard -> size as in meta/info.json; an empty dict if that file does not match the manifest."""
+    """Return the sizes of the shards in meta/info.json, by shard; empty if that file does not match the manifest."""
     try:
         path = resolve_inside(root, INFO)
         regular_file_size(path, LARGEST)

@@ -96,7 +96,7 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
 def _check_disjoint_teammates(tasks: Iterable[Task], report: Report) -> None:
     """Check that training and test tasks of a track have no common teammates."""
     seen: dict[tuple[str, str, str], str] = {}
-    for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # "train" comes before "test"
+    for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # training tasks before test tasks
         key = (task.track, task.layout.name, json.dumps(task.teammate, sort_keys=True))
         if task.split == "train":
             seen[key] = task.task_id
@@ -115,7 +115,7 @@ def _check_info(index: Index, tasks: list[Task], provenance: ProvenanceByTask | 
     elif report.ok and provenance is not None:
         statistics = layout_statistics(described, entries, tasks, provenance, info.shards)
         described = replace(described, shards=info.shards, statistics=statistics)
-    found = parse_json(read_text(resolve_inside(root, INFO)))  # may have fields that `ReleaseInfo` does not have
+    found = parse_json(read_text(resolve_inside(root, INFO)))  # may have unknown fields
     for name in sorted(found.keys() - {field.name for field in fields(ReleaseInfo)}):
         report.add(INFO, f"{name}: an unknown field")
     for name, expected in described.to_json().items():
@@ -150,7 +150,7 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
 
 
 def _contradictions(made: Provenance, entries: Sequence[Entry], seed: int | None) -> Iterator[str]:
-    """Yield each contradiction of a provenance to itself, to the index or to the task's seed."""
+    """Yield each contradiction within a provenance, or with the index or the task's seed."""
     first, count = entries[0], len(entries)
     if first.source in SCRIPTED_SOURCES and made.expert and made.expert.policy_sha256:
         labeller = made.expert.policy_sha256

@@ -1,7 +1,7 @@
 """Entry point of `icrl4aht-data`: imports a command only when it runs, and converts errors to exit codes.
 
 Exit codes: 0 success; 1 an error, a problem found, or a closed output pipe; 2 a misused command; 128 plus the signal's
-number after a signal stopped a training, which was saved.
+number after a signal stopped a training run, whose state was saved.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from icrl4aht_data.utils.plugins import Plugins
 
 _REMEDIES = {
     errno.ENOENT: "check the path; a new file's folder has to exist",
-    errno.ENOTDIR: "a file is where a folder is needed: give another folder",
-    errno.EEXIST: "a file is where a folder is needed: give another folder",
-    errno.EISDIR: "a folder is where a file is needed: give another name",
+    errno.ENOTDIR: "expected a folder, found a file: give another folder",
+    errno.EEXIST: "expected a folder, found a file: give another folder",
+    errno.EISDIR: "expected a file, found a folder: give another name",
     errno.EACCES: "give a folder that you may write to, and files that you may read",
     errno.EPERM: "give a folder that you may write to, and files that you may read",
     errno.EROFS: "give a folder that can be written to",
@@ -56,7 +56,7 @@ Completion, in bash (for zsh and fish: zsh_source, fish_source):
 
 @cache
 def all_verbs() -> dict[str, Verb]:
-    """Return command name -> `Verb`, for the commands of this and other installed packages.
+    """Return the `Verb` of every command of this and other installed packages, by the command's name.
 
     Raises:
         PluginError: if a package's table cannot be imported, or a command already exists.
@@ -71,7 +71,7 @@ def all_verbs() -> dict[str, Verb]:
 
 
 class VerbGroup(click.Group):
-    """Command group with a help that lists commands under headings, without importing them.
+    """Command group whose help text lists commands under headings, without importing them.
 
     Args:
         prefix: start of the names of the group's commands, such as "research "; empty for the program.
@@ -109,7 +109,7 @@ class VerbGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def _verbs(self) -> dict[str, Verb]:
-        """Return the last word of a name -> `Verb`, for this group's commands in the order of their headings."""
+        """Return the `Verb` of each command of this group by the name's last word, in the order of the headings."""
         found = {
             name.removeprefix(self._prefix): verb
             for name, verb in all_verbs().items()
@@ -139,7 +139,7 @@ def run(command: click.Command) -> None:
     If the reader of a pipe exits (`| head`), the command stops quietly with exit code 1. Output to a stream that is
     closed from the start (`>&-`) is dropped.
     """
-    for name in ("stdout", "stderr"):  # a closed stream becomes the null device, so no file gets its number
+    for name in ("stdout", "stderr"):  # so that no opened file gets the descriptor of a closed stream
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     try:
@@ -157,7 +157,7 @@ def run(command: click.Command) -> None:
             raise
         _exit_with_error(message, 1)
     except SystemExit as stop:
-        if message := getattr(stop, "message", None):  # a training was stopped by a signal and saved
+        if message := getattr(stop, "message", None):  # a signal stopped a training run, which was saved
             click.echo(message, err=True)
         raise
 

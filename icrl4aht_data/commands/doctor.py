@@ -45,7 +45,7 @@ Problems = dict[str, str]
 
 
 def diagnose() -> dict[str, Any]:
-    """Examine this installation without network access and without leaving files.
+    """Examine this installation without network access, and leave no files behind.
 
     Returns:
         A JSON object: "ok", then a mapping of findings per section (sizes in bytes), then "problems".
@@ -127,7 +127,7 @@ def _devices(problems: Problems) -> dict[str, Any]:
 def _query_jax() -> str:
     """Return JAX's backend and devices as JSON, found by a separate process.
 
-    So a broken JAX cannot crash this process, and no GPU memory stays allocated.
+    Thus a broken JAX cannot crash this process, and no GPU memory stays allocated.
     """
     environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     command = [sys.executable, "-P", "-c", _JAX_CODE]

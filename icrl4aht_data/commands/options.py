@@ -1,4 +1,4 @@
-"""Types of arguments and options, and complete options, that several commands share."""
+"""Types of arguments and options, and decorators that add options, shared by several commands."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ FAMILY = Names("family", all_families)
 
 
 class Folder(click.Path):
-    """Click type of a folder, which need not exist; an empty text, as from an unset shell variable, is an error.
+    """Click type of a folder, which need not exist; an empty string, as from an unset shell variable, is an error.
 
     Args:
         made_by: the command that makes such folders, for the message; if given, the folder must exist.
@@ -80,7 +80,7 @@ class Folder(click.Path):
 
 
 class Root(Folder):
-    """Click type of a release: a folder, converted to a path, or an address, which remains a text.
+    """Click type of a release: a folder, converted to a path, or an address, which remains a string.
 
     Args:
         remote: accept addresses only.
@@ -147,7 +147,7 @@ _FILTERS: dict[str, tuple[click.ParamType, str | None, str]] = {
 
 
 def filter_options(command: Any) -> Any:
-    """Add the options that select histories; their values are lists, or None for any, as in `load_icrl4aht`."""
+    """Add the options that select histories; each value is a list, or None for all, as in `load_icrl4aht`."""
     for name, (kind, metavar, about) in reversed(_FILTERS.items()):
         settings: dict[str, Any] = {"type": kind, "metavar": metavar, "help": about, "multiple": True}
         command = click.option(f"--{name}", callback=lambda ctx, param, value: list(value) or None, **settings)(command)

@@ -113,8 +113,8 @@ def show(
     """Show a release, a part of it or one history.
 
     Prints a summary, a table of the layouts with totals, and versions, counts, splits, sources and labels; for one
-    history, all fields of its index entry. If the output is not a terminal, prints the name of each fact, a tab and its
-    value on one line. Only --plot writes a file.
+    history, all fields of its index entry. If the output is not a terminal, prints one line for each value:
+    the name, a tab and the value. Only --plot writes a file.
     """
     if overwrite and plot is None:
         raise click.UsageError("--overwrite replaces an existing picture: also give --plot FILE")
@@ -191,7 +191,7 @@ def browse(
     all episodes fit, the page has some episodes of each history, including the first and the last, and says which. A
     release of observations cannot be shown, since it has no states to draw.
     """
-    with suppress(OSError), out.open("rb") as stream:  # replaces a page that this command wrote earlier
+    with suppress(OSError), out.open("rb") as stream:  # a page of this command may be replaced
         overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
     check_output(out, overwrite)
     matching = load_icrl4aht(root, **filters)
@@ -327,7 +327,7 @@ def convert(
         advance(0, None)  # the total is unknown before the first history
         if isinstance(root, Path) and (root / HISTORIES_H5).exists():
             if (form is not None and form not in ALL_KINDS) or any(filters.values()):
-                raise click.UsageError("published files convert only to full, lite or observations, without filters")
+                raise click.UsageError("convert published files to full, lite or observations, without filters")
             form = from_published(
                 root,
                 target,

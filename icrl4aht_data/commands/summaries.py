@@ -22,7 +22,7 @@ _IDS_SHOWN = 11  # maximum number of characters of a task's history ids in the t
 
 
 def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
-    """Return a JSON object with facts for each task that has histories among `entries`."""
+    """Return a JSON object for each task of `entries`: its names, counts, returns and labels."""
     return [
         {
             "task_id": task_id,
@@ -78,7 +78,7 @@ def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
 
 
 def id_ranges(ids: Sequence[int]) -> str:
-    """Return ids as a text of ranges in ascending order, such as "3,158-163"."""
+    """Return ids as a string of ranges in ascending order, such as "3,158-163"."""
     numbers = set(ids)
     firsts = sorted(number for number in numbers if number - 1 not in numbers)
     lasts = sorted(number for number in numbers if number + 1 not in numbers)
@@ -121,7 +121,7 @@ def fact_lines(facts: Mapping[str, Any], indent: str = "") -> Iterator[str]:
 
 
 def tab_separated(rows: Iterable[Iterable[Any]]) -> str:
-    """Return rows as lines of tab-separated values; values other than texts and numbers are printed as JSON."""
+    """Return rows as lines of tab-separated values; values other than strings and numbers are printed as JSON."""
     texts = (["" if one is None else one if isinstance(one, str) else json.dumps(one) for one in row] for row in rows)
     return "\n".join("\t".join(row) for row in texts)
 

@@ -23,9 +23,9 @@ from icrl4aht_data.errors import CacheError, Icrl4ahtError, OptionError
 from icrl4aht_data.utils.files import NO_ROOM, add_filename, allocate, describe_disk
 from icrl4aht_data.utils.system import CACHE_VARIABLE, cache_folder, cache_limit
 
-_CONTENTS = "contents.json"  # lists dtype and shape of every array by name
+_CONTENTS = "contents.json"  # file with dtype and shape of every array
 _KEY = re.compile(r"[a-z]+-[0-9a-f]{32,64}")  # only folders with such a name are removed to free space
-_ABANDONED = 24 * 3600  # seconds after which an unfinished set is removed as left by a killed process
+_ABANDONED = 24 * 3600  # seconds after which the maker of an unfinished set counts as killed
 
 Arrays = dict[str, np.ndarray]
 
@@ -60,7 +60,7 @@ def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
     """
     assert _KEY.fullmatch(key), key
     folder = cache_folder() / key
-    arrays = _open(folder)
+    arrays = _open_arrays(folder)
     if arrays is not None:
         return arrays
     if size > cache_limit():
@@ -76,7 +76,7 @@ def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
     except Icrl4ahtError:
         raise
     except OSError as error:
-        raise _unusable(folder.parent, size, error) from error
+        raise _write_error(folder.parent, size, error) from error
 
 
 def new_mapped_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.memmap:
@@ -92,7 +92,7 @@ def new_mapped_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.
     return np.lib.format.open_memmap(path, mode="r+")
 
 
-def _open(folder: Path) -> Arrays | None:
+def _open_arrays(folder: Path) -> Arrays | None:
     """Return the arrays of a folder, and mark the folder as used; None if a file is missing, cut off or damaged."""
     arrays = {}
     if not all(path.is_file() for path in (folder / _CONTENTS, *folder.glob("*.npy"))):  # opening a FIFO would hang
@@ -124,17 +124,17 @@ def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> Arrays
     contents = {path.stem: _describe(np.lib.format.open_memmap(path, mode="r")) for path in paths}
     (new / _CONTENTS).write_text(json.dumps(contents), encoding="utf-8")
     for _ in range(3):
-        arrays = _open(folder)
+        arrays = _open_arrays(folder)
         if arrays is not None:
             return arrays
-        with suppress(OSError):  # moves away a damaged set, or another file or folder with this name
+        with suppress(OSError):  # a damaged set, or anything else with this name, is in the way
             folder.rename(scratch / "damaged")
-        with suppress(OSError):  # fails if another process has just moved a set to this folder
+        with suppress(OSError):  # another process may just have moved a set to this folder
             new.rename(folder)
     raise CacheError(f"{folder}: arrays just written cannot be read: check the disk")
 
 
-def _unusable(folder: Path, size: int, error: OSError) -> CacheError:
+def _write_error(folder: Path, size: int, error: OSError) -> CacheError:
     """Return a `CacheError` for a failed write to the cache folder."""
     if error.errno in NO_ROOM:
         room = describe_disk(folder)

@@ -31,7 +31,7 @@ def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict
     Args:
         folder: the folder `TEAMMATES` of a release, or the folder of a suite.
         task: the task; a heuristic teammate has no files.
-        root: the release folder that contains `folder`; symbolic links must not lead out of the release.
+        root: the release folder that contains `folder`; symbolic links must not point outside the release.
 
     Returns:
         Files by path in a release; empty if the folder has no checkpoint.
@@ -57,7 +57,7 @@ def expert_files(folder: Path, sha256: str, root: Path | None = None) -> dict[st
     Args:
         folder: folder of the checkpoint; in a release, this is `expert_folder`.
         sha256: SHA-256 of the policy's weights.
-        root: the release folder that contains `folder`; symbolic links must not lead out of the release.
+        root: the release folder that contains `folder`; symbolic links must not point outside the release.
 
     Returns:
         Files by path in a release; empty if the folder has no checkpoint.

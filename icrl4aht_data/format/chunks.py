@@ -51,7 +51,7 @@ def read_table(path: Path) -> np.ndarray:
     """
     try:
         if path.stat().st_size > _TABLE_BYTES:
-            raise ValueError(f"more than {_TABLE_BYTES:,} bytes")
+            raise ValueError(f"expected at most {_TABLE_BYTES:,} bytes")
         table = np.lib.format.open_memmap(path, mode="r")  # rejects archives, which `np.load` opens
     except FileNotFoundError as error:
         raise ChunkTableError(f"{path}: the chunk table is missing; fetch the release again") from error
@@ -60,7 +60,7 @@ def read_table(path: Path) -> np.ndarray:
     if table.dtype != CHUNK_DTYPE or table.ndim != 1:
         raise ChunkTableError(f"{path}: expected rows of {CHUNK_DTYPE}, found {table.dtype} of shape {table.shape}")
     if (table["size"] > _ROW_BYTES).any():
-        raise ChunkTableError(f"{path}: a row covers more than {_ROW_BYTES:,} bytes")
+        raise ChunkTableError(f"{path}: expected chunks of at most {_ROW_BYTES:,} bytes, found a larger one")
     return table
 
 

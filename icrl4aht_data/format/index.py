@@ -97,7 +97,7 @@ class Columns:
         values: dict[str, Any] = {name: self._arrays[name][row].item() for name in _NUMBERS}
         values |= {name: self._values[name][self._arrays[name][row]] for name in _STRINGS}
         for name, absent in _ABSENT.items():
-            if values[name] == absent or values[name] != values[name]:  # NaN differs from itself
+            if values[name] == absent or values[name] != values[name]:  # the second test finds NaN
                 values[name] = None
             elif name in ENCODED:
                 values[name] = msgspec.json.decode(values[name], type=ENTRY_HINTS[name])

@@ -74,7 +74,7 @@ def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
 
     Raises:
         IndexFormatError: if the manifest is empty or a line is malformed; the message has the line number.
-        UnsafePathError: if a path leads out of the release, or is not the path of a release's file.
+        UnsafePathError: if a path points outside the release, or is not the path of a release's file.
     """
     if not text:
         raise IndexFormatError(f"{path} is empty: expected a line for each file of the release; fetch it again")
@@ -89,7 +89,7 @@ def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
         digest, name = match.groups()
         if not is_safe_path(name):
             raise UnsafePathError(
-                f"{path}, line {number}: {name!r} leads out of the release: do not use it, and warn the publisher"
+                f"{path}, line {number}: {name!r} points outside the release: do not use it, and warn the publisher"
             )
         if not is_known_file(name):
             raise UnsafePathError(

@@ -293,7 +293,7 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class _EgoScale(Struct):
-    """Those hyper-parameters of the ego that this package reads."""
+    """Hyper-parameters of the ego that this package reads; it ignores the others."""
 
     total_steps: int
     environments: int

@@ -1,4 +1,4 @@
-"""Safe reading of untrusted HDF5 files, because libhdf5 follows links to other files, loads plugins and trusts sizes.
+"""Safe reading of untrusted HDF5 files: libhdf5 itself follows links to other files, loads plugins and trusts sizes.
 
 Each check runs before the libhdf5 call that it protects. Rejected content raises ValueError; damaged content may raise
 any error of h5py. Callers add the file's name to the message.
@@ -24,8 +24,8 @@ h5d, h5l, h5t, h5z = _low.h5d, _low.h5l, _low.h5t, _low.h5z
 
 SHUFFLE, DEFLATE = h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE
 
-_SUPERBLOCKS = tuple(b"\x89HDF\r\n\x1a\n" + bytes([version, 8, 8]) for version in (2, 3))  # for addresses of 8 bytes
-_LOCAL_HEAP = re.compile(rb"HEAP\0.{8}\0{3}", re.DOTALL)  # with a size below a terabyte; libhdf5 rejects larger sizes
+_SUPERBLOCKS = tuple(b"\x89HDF\r\n\x1a\n" + bytes([version, 8, 8]) for version in (2, 3))  # 8-byte addresses
+_LOCAL_HEAP = re.compile(rb"HEAP\0.{8}\0{3}", re.DOTALL)  # libhdf5 rejects sizes of a terabyte or more
 
 _CHUNK_BYTES = 256 * 2**20
 _ELEMENT_BYTES = 2**16
@@ -51,31 +51,31 @@ def find_node(group: Any, path: str) -> Any:
     """Return the group or dataset at a path in a group; None if the path does not exist.
 
     Raises:
-        ValueError: if a link on the path may lead out of the file.
+        ValueError: if a link on the path may point outside the file.
     """
     for part in path.strip("/").split("/"):
         name = part.encode()
         if part in ("", ".") or not isinstance(group, h5py.Group) or not group.id.links.exists(name):
             return None
         if group.id.links.get_info(name).type != h5l.TYPE_HARD:
-            raise ValueError(f"{path}: expected a hard link, found a link that may lead out of the file")
+            raise ValueError(f"{path}: expected a hard link, found a link that may point outside the file")
         group = group[part]
     return group
 
 
 def read_attributes(file: h5py.File) -> dict[str, Any]:
-    """Return the file's attributes by name; the value of a text attribute is the type `str` instead of the text.
+    """Return the file's attributes by name; the value of a string attribute is the type `str`, not the string.
 
-    Texts are not read, because HDF5 stores texts in a global heap, which may be forged to be endless.
+    Strings are not read, because HDF5 stores strings in a global heap, which may be forged to be endless.
 
     Raises:
-        ValueError: if there are too many attributes, or an attribute is not a single number or text.
+        ValueError: if there are too many attributes, or an attribute is not a single number or string.
     """
     found = {}
     for number, name in enumerate(file.attrs):
         attribute = file.attrs.get_id(name)
         if number == _ATTRIBUTES or attribute.shape or _type_class(attribute) not in (h5t.INTEGER, h5t.STRING):
-            raise ValueError(f"attribute {name!r}: expected at most {_ATTRIBUTES} attributes, each a number or a text")
+            raise ValueError(f"attribute {name!r}: expected at most {_ATTRIBUTES} attributes, each a number or string")
         found[name] = file.attrs[name] if _type_class(attribute) == h5t.INTEGER else str
     return found
 

@@ -242,7 +242,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         """Return the field that stores the values of a field.
 
         For `oracle_actions` of a noise history this may be `expert_actions`: the expert is the oracle, so a release may
-        store the actions only once. For other fields it is the field itself.
+        store the actions only once. Other fields store their own values.
         """
         same = field.name == "oracle_actions" and self.source == "noise" and not self.has_oracle_actions
         return FIELDS["expert_actions"] if same else field
@@ -269,7 +269,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return msgspec.structs.asdict(self) | {"obs_shape": list(self.obs_shape)} | texts
 
 
-_LEFT_OUT = ("label_view", "teammate_of_episode")  # not written if None, so that the bytes of old releases stay equal
+_LEFT_OUT = ("label_view", "teammate_of_episode")  # omitted if None, so that old index lines keep their bytes
 
 ENTRY_HINTS: dict[str, Any] = get_type_hints(Entry)
 """Types of the fields of an index line by name, without bounds."""

@@ -1,1 +1,1 @@
-"""OvercookedV2 for NumPy and JAX, batch axes first: layouts, state record, rules, observations, pictures."""
+"""OvercookedV2 for NumPy and JAX arrays, batch axes first: layouts, state records, rules, observations, pictures."""

@@ -54,12 +54,12 @@ def fast_observe(
     flat = out.reshape(len(records), VISIBLE, observation_shape(layout, canonical)[-1])
     renderer = _renderer(layout, out.dtype.str, canonical)
 
-    def part(start: int, stop: int) -> None:
+    def render_slice(start: int, stop: int) -> None:
         for first in range(start, stop, _SLAB):
             last = min(first + _SLAB, stop)
             renderer.render(records[first:last], flat[first:last])
 
-    run_in_slices(part, len(records), threads, least=_SLAB)
+    run_in_slices(render_slice, len(records), threads, least=_SLAB)
     return out
 
 

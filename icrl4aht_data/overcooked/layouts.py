@@ -131,7 +131,7 @@ class Layout:
 
     @cached_property
     def ingredients(self) -> tuple[int, ...]:
-        """Ids of the ingredients that have a pile, ascending; the k-th is counted by bits 2 + 2k, 3 + 2k of an item."""
+        """Ids of the ingredients that have a pile, ascending; bits 2 + 2k, 3 + 2k of an item count the k-th."""
         return tuple(sorted({int(c) for c in "".join(self.rows) if c in digits}))
 
     @cached_property

@@ -128,7 +128,7 @@ def _check_records(layout: Layout, records: np.ndarray, dimensions: int, cell: i
 
 
 def _shared_palette(frames: list[Image.Image]) -> Image.Image:
-    """Return a palette for all frames; a colour ranks by its largest pixel count in any single frame."""
+    """Return a palette for all frames; colours are ranked by their largest pixel count in a frame."""
     most = Counter()
     for frame in frames:
         most |= Counter({colour: count for count, colour in frame.getcolors(frame.width * frame.height) or []})

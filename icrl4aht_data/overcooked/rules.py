@@ -215,5 +215,5 @@ def _range(xp, n: int) -> Array:
 
 
 def _read(xp, at: Array, values: Array) -> Array:
-    """Return the element of `values` (B, K) that the one-hot mask `at` (B, K) selects, uint8 (B,); 0 for none."""
+    """Return the element of `values` (B, K) that the one-hot mask `at` (B, K) selects, uint8 (B,); 0 if none."""
     return xp.sum(xp.where(at, values, xp.zeros_like(values)), axis=-1, dtype=xp.uint8)

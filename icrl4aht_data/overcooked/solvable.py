@@ -17,7 +17,7 @@ _NEEDED = {GOAL: "a goal", POT: "a pot", PLATES: "a plate pile"}
 def check_solvable(layout: Layout) -> None:
     """Check that the agents of a layout can deliver every recipe.
 
-    Each ingredient has to reach a pot, and the soup of this pot has to reach a goal on a plate. Agents carry items on
+    Each ingredient has to reach a pot, and a plate with the soup of this pot has to reach a goal. Agents carry items on
     their reachable floor, and hand over items on counters that both agents can face.
 
     Raises:

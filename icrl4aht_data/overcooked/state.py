@@ -70,7 +70,7 @@ def columns(layout: Layout | Tables) -> State:
 
 
 def record_size(*layouts: Layout | Tables) -> int:
-    """Return the number S of bytes of a state record, padded so that it fits each of the given layouts or tables."""
+    """Return the size in bytes of a state record that is padded to fit each of the given layouts or tables."""
     pots, buttons, counters = np.max([_counts(layout) for layout in layouts], axis=0).tolist()
     return 8 + 2 * pots + buttons + counters
 

@@ -202,7 +202,7 @@ def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = N
     row, column = np.divmod(np.arange(layout.cells, dtype=np.int32), layout.width)
     beside = _neighbours(layout)
     near = np.bitwise_or.reduce(np.where(beside >= 0, 1 << kinds.astype(int)[beside], 0), axis=1).astype(np.uint8)
-    distance, first_step = _search(layout)
+    distance, first_step = _shortest_paths(layout)
     # A neighbour of -1 indexes the last cell, but `where` replaces this value.
     to_access = np.where((beside >= 0) & walkable[beside], distance[:, beside], NOWHERE).min(axis=-1)
     canonical = CANONICAL_TYPES if layout.ingredient_types <= CANONICAL_TYPES else 0
@@ -258,8 +258,8 @@ def _stations(layout: Layout, column: np.ndarray, row: np.ndarray) -> np.ndarray
     return (distance_to(POT, PILE) - distance_to(GOAL, PLATES)).astype(np.float32)
 
 
-def _search(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tables `Tables.distance` and `Tables.first_step`, from a search for shortest paths."""
+def _shortest_paths(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Return the tables `Tables.distance` and `Tables.first_step`."""
     far, here = np.int32(NOWHERE), np.arange(layout.cells)
     distance = np.where((here[:, None] == here) & layout.walkable, 0, far)
     ends = layout.moves[:, SEARCH_ORDER]  # shape (cells, 4)

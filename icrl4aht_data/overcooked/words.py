@@ -225,7 +225,7 @@ def _contents(layout: Layout, canonical: bool) -> dict[int, tuple[np.ndarray, np
     for slot in _slots(layout):
         if slot.kind not in found and (views := np.argwhere(layout.window_position[:, slot.cells] != NOWHERE)).size:
             observer, cell = views[0][0], slot.cells[views[0][1]]
-            shown = _shown(layout, slot, pairs[slot.kind], observer, cell, canonical)
+            shown = _slot_view(layout, slot, pairs[slot.kind], observer, cell, canonical)
             found[slot.kind] = pairs[slot.kind], shown
     bodies = (carried + (np.arange(len(FACINGS))[:, None] << 8)).ravel()
     record = np.zeros((len(bodies), record_size(layout)), np.uint8)
@@ -238,7 +238,7 @@ def _contents(layout: Layout, canonical: bool) -> dict[int, tuple[np.ndarray, np
     return found | {_SELF: (bodies, own), _OTHER: (bodies, np.roll(own, channels, axis=-1))}
 
 
-def _shown(layout: Layout, slot: _Slot, pairs: np.ndarray, observer: int, cell: int, canonical: bool) -> np.ndarray:
+def _slot_view(layout: Layout, slot: _Slot, pairs: np.ndarray, observer: int, cell: int, canonical: bool) -> np.ndarray:
     """Return the channels uint8 (n, C) of a slot's cell, seen from the cell `observer`."""
     record = np.zeros((len(pairs), record_size(layout)), np.uint8)
     record[:, slot.byte] = pairs & 255

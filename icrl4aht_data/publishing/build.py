@@ -55,7 +55,7 @@ def build_release(
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`, or a library is not installed.
-        ReleaseError: if `source` is not valid; names the first three problems.
+        ReleaseError: if `source` is not valid; the message names three problems.
     """
     source, target = as_path(MINI if source is None else source).resolve(), as_path(target)
     check_target(target, overwrite, [source])
@@ -80,7 +80,7 @@ def build_release(
         digests = {name: file_hash(root / name) for name in files_below(root)}
         for name, digest in kept.items():
             if digests.get(name) != digest:
-                raise ReleaseError(f"{source / name}: changed while it was copied, sha256 now {digests.get(name)}")
+                raise ReleaseError(f"{source / name}: changed while it was copied; sha256 is now {digests.get(name)}")
         today = datetime.datetime.now(datetime.UTC).date()
         write_json(root / CROISSANT, croissant(root, digests, published or today))
         write_manifest(root, digests)
@@ -91,10 +91,10 @@ def check_valid(root: Path, advance: NamedProgress = lambda what, done, total: N
     """Verify a release, and raise an error if a problem is found.
 
     Raises:
-        ReleaseError: if a problem is found; names the first three.
+        ReleaseError: if a problem is found; the message names the first three.
     """
     if not (root / MANIFEST).exists():
-        read_info(root)  # raises a helpful error if the folder is not a release
+        read_info(root)  # its error says that the folder is not a release
     report = verify_release(root, advance=advance)
     if not report.ok:
         found = first_problems([f"{finding.file}: {finding.problem}" for finding in report.findings])
@@ -102,7 +102,7 @@ def check_valid(root: Path, advance: NamedProgress = lambda what, done, total: N
 
 
 def first_problems(problems: Sequence[str]) -> str:
-    """Return a text with the first three problems and the number of further problems."""
+    """Return text with the first three problems and the number of further problems."""
     more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
     return "; ".join(problems[:3]) + more
 

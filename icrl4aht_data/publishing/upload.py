@@ -20,7 +20,7 @@ from icrl4aht_data.utils.text import counted_noun
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
-_HUB_FILE = ".gitattributes"  # the Hub adds it to every repository
+_HUB_FILE = ".gitattributes"  # the Hub adds this file to every repository
 _NOTHING_SENT = "nothing was sent: run the same command again"
 _KEPT = "files sent so far are kept: run the same command to resume"
 
@@ -120,11 +120,11 @@ def _complete_plan(api: HfApi, plan: Upload, folder: Path, private: bool) -> Upl
         if differences := _differences(api, plan, commit, folder):
             raise UploadError(
                 f"{plan.repo}: tag {plan.tag} exists with other content: {first_problems(differences)}; tags do not "
-                "move: give the data another data version"
+                "move: give the release another data version"
             )
         return replace(plan, done="already there", commit=commit)
     if private and not api.repo_info(plan.repo, repo_type="dataset").private:
-        raise UploadError(f"{plan.repo}: is a public repository; make it private in its settings, or give another one")
+        raise UploadError(f"{plan.repo} is a public repository; make it private in its settings, or give another one")
     present = _repository_files(api, plan.repo, "main")
     foreign = sorted(present - plan.files.keys())
     listed: Mapping[str, str] = {}

@@ -126,6 +126,6 @@ def import_pyarrow() -> Any:
     """Return the module pyarrow.
 
     Raises:
-        OptionError: if pyarrow is not installed; names the command that installs pyarrow.
+        OptionError: if pyarrow is not installed; the message names the command that installs it.
     """
     return import_optional("pyarrow", "Parquet")

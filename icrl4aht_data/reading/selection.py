@@ -150,7 +150,7 @@ class Selection:
 
     @cached_property
     def provenance(self) -> ProvenanceByTask:
-        """Task id -> record of how the task's histories were made, as in meta/provenance.json."""
+        """Records of how each task's histories were made, by task id, as in meta/provenance.json."""
         return read_provenance(self.origin.file(PROVENANCE))
 
     @property
@@ -256,7 +256,7 @@ class Selection:
             shape with channels="own". `teammate_of_episode` is JSON text.
 
         Raises:
-            UnknownNameError: if there is no such field; suggests the nearest name.
+            UnknownNameError: if there is no such field; the message suggests the nearest name.
         """
         name = ALIASES.get(name, name) if isinstance(name, str) else name
         if not isinstance(name, str) or name not in ENTRY_HINTS:
@@ -431,10 +431,10 @@ class Selection:
             OptionError: for anything but integers, and for a bool array of another length.
         """
         try:
-            given = np.asarray(ids)  # accepts a list of bools, for example from a comprehension
+            given = np.asarray(ids)  # a list of bools is accepted, too
         except (TypeError, ValueError) as error:  # raised for nested lists of unequal length
             raise OptionError(f"select: expected a list of history ids, found {ids!r:.200}") from error
-        if given.dtype == bool and given.shape == self.ids.shape:  # a mask, replaced by the ids that it keeps
+        if given.dtype == bool and given.shape == self.ids.shape:  # a mask is replaced by the ids that it keeps
             given = self.ids[given]
         if not given.size:
             raise EmptySelectionError(f"{self.root}: select: expected at least one history id, found none")

@@ -162,7 +162,7 @@ class Shard:
             raise self._read_error(error) from error
         offset, length = self.table["offset"], self.table["size"]
         if int(length.sum(dtype=np.int64)) > size >= int((offset + length).max(initial=0)):
-            raise ShardMismatchError(f"{self.path}: has {size} bytes, and the chunk table uses some of them twice")
+            raise ShardMismatchError(f"{self.path}: some of its {size} bytes belong to two chunks of the chunk table")
         beyond = np.flatnonzero((offset > size) | (length > np.maximum(size, offset) - offset))
         if len(beyond):
             raise ShardTruncatedError(
@@ -181,7 +181,7 @@ class Shard:
         """Return rows start..stop of a field, in the field's dtype. The range must be within the history.
 
         Raises:
-            ShardCorruptError: if the hash or size of a chunk is wrong; names the chunk.
+            ShardCorruptError: if the hash or size of a chunk is wrong; the message names the chunk.
         """
         what = f"{self.path}: history {history_id}: {field.name}"
         rows = new_array((stop - start, *self._elements[field.name].shape), field.dtype, what)
@@ -197,7 +197,7 @@ class Shard:
             keep: add decoded chunks to the cache; False for rows that are read once.
 
         Raises:
-            ShardCorruptError: if the hash or size of a chunk is wrong; names the chunk.
+            ShardCorruptError: if the hash or size of a chunk is wrong; the message names the chunk.
             ShardMismatchError: if the dtype of `out` cannot represent a value.
         """
         stored, length = self.entries[history_id].stored_field(field), self._chunk_rows(history_id, field)
@@ -241,7 +241,7 @@ class Shard:
         """Return the stored bytes of the chunk in one row of the chunk table, after checking their hash.
 
         Raises:
-            ShardCorruptError: if the bytes are damaged; names the chunk.
+            ShardCorruptError: if the bytes are damaged; the message names the chunk.
         """
         offset, size = self.table[row].item()[:2]
         try:
@@ -275,7 +275,7 @@ class Shard:
                 yield first + number, history_id, FIELDS[name]
 
     def describe(self, row: int) -> str:
-        """Return a text that identifies a chunk in messages, with number, field, history and bytes."""
+        """Return a description of a chunk for messages, with its number, field, history and bytes."""
         offset, size = int(self.table["offset"][row]), int(self.table["size"][row])
         if not self.table["rows"][row]:
             return f"bytes {offset}..{offset + size}, between the chunks"

@@ -64,7 +64,7 @@ class ADBatch(NamedTuple, Generic[A]):
     attention_mask: A
     prev_teammate_actions: A | None = None
     layouts: A | None = None
-    is_first: A = cast(Any, None)  # a default is required after others; samplers always set it
+    is_first: A = cast(Any, None)  # the default is required but never used
     families: A | None = None
 
     describe = describe_batch
@@ -202,7 +202,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         # -1 comes first, for `prev_*`. Padding repeats the last step, since all rows must exist.
         t = np.minimum(start[:, None] + np.arange(-1, self.length), total[:, None] - 1)
         rows = low[:, None] + (first[:, None] + self.every * (t // steps)) * steps + t % steps
-        # At a window's first step, `prev_*` come from the preceding step of the history, of any episode.
+        # At a window's first step, `prev_*` come from the preceding step of the history, also across episodes.
         rows[start == 0, 0] = (low + first * steps - 1)[start == 0]
         return _Windows(position, rows[:, 1], rows[:, 1:], rows[:, :-1], valid)
 

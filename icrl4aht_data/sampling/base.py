@@ -88,7 +88,7 @@ class Sampler(Generic[B, D, T]):
             )
         self.local_size = batch_size // process_count
         self.dataset, self.layouts, self._observer = dataset, dataset.layouts, Observer(dataset)
-        # Checked before the first batch, which a training may need only after an hour of compilation.
+        # Checked here, since a training run may take the first batch only after an hour of compilation.
         if teammate_actions and not dataset.column("has_teammate_actions").all():
             raise LabelsMissingError("teammate_actions = True: some histories have no teammate actions")
         self.teammate_actions = teammate_actions
@@ -96,7 +96,7 @@ class Sampler(Generic[B, D, T]):
 
     @cached_property
     def specs(self) -> dict[str, ArraySpec]:
-        """Field of a batch -> dtype and shape of the field's array."""
+        """Dtype and shape of each array of a batch, by field name."""
         raise NotImplementedError
 
     def __len__(self) -> int:
@@ -147,7 +147,7 @@ class Sampler(Generic[B, D, T]):
     ) -> Batches[D]: ...
 
     def batches(self, start: int = 0, stop: int | None = None, **options: Any) -> Batches[Any]:
-        """Return an iterator over batches from `start` on that prefetches on a thread; see `Batches`."""
+        """Return an iterator over batches from number `start` on, prefetched by a thread; see `Batches`."""
         return Batches(self, start, stop, **options)
 
     def options(self) -> dict[str, Any]:
@@ -173,7 +173,7 @@ class Sampler(Generic[B, D, T]):
         return random_uint32(self.seed, i, count, self.batch_size)[:, first : first + self.local_size]
 
     def _layout_specs(self) -> dict[str, ArraySpec]:
-        """Return the spec of the field `layouts`, which only batches of state records of several layouts have."""
+        """Return dtype and shape of the field `layouts`; {} unless batches have state records of several layouts."""
         # A state record cannot be interpreted without its layout, a rendered observation can.
         several = self.dataset.obs == "state" and len(self.layouts) > 1
         return {"layouts": ArraySpec("int32", (self.local_size,))} if several else {}
@@ -216,7 +216,7 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
 
     Raises:
         UnknownNameError: if `labels` is not a kind of labels.
-        LabelsMissingError: if a history does not have the labels; names the labels that the selection has.
+        LabelsMissingError: if a history does not have the labels; the message names existing labels.
     """
     check_choice("labels", labels, LABELS)
     has = {name: dataset.has_labels(name) for name in LABELS}
@@ -233,7 +233,7 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
 
 
 def warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
-    """Warn of tasks whose labels come from a policy that earns less than half of the final return of their histories.
+    """Warn of tasks whose labels come from a policy that earns less than half of the histories' final return.
 
     The final return is the mean of `return_end` over a task's selected histories; see `schema.are_labels_weak`.
     """
@@ -268,7 +268,7 @@ def describe_batch(self: Any) -> str:
 
 
 def _array_lines(arrays: Mapping[str, Any]) -> str:
-    """Return name, dtype and shape of each array, one per line; other objects, such as shardings, as text."""
+    """Return one line per entry: name, dtype and shape of an array, or the text of another object (a sharding)."""
     width = max(map(len, arrays), default=0)
     shown = {
         name: f"{str(array.dtype).removeprefix('torch.'):<8} {tuple(array.shape)}" if hasattr(array, "dtype") else array

@@ -73,7 +73,7 @@ class Batches(Iterator[B], Generic[B]):
         self._lent: B | None = None  # buffer of the batch in use by the consumer
 
     def __iter__(self) -> Batches[B]:
-        # A new pass starts only after iteration reached the end: a position loaded at the end is a finished training.
+        # A new pass starts only after iteration reached the end: a position loaded at the end is a finished run.
         if self._ended and self._stop is not None and self._per_pass:
             self._stop += (self.next - self._stop) // self._per_pass * self._per_pass + self._per_pass
             self._closed = self._ended = False
@@ -171,7 +171,7 @@ class Batches(Iterator[B], Generic[B]):
         """Continue from the position at which `state_dict` was called.
 
         Raises:
-            OptionError: if the sampler's options or selection differ from those in the state; names the differences.
+            OptionError: if the sampler's options or selection differ from the state; the message names the differences.
         """
         if not isinstance(state, Mapping):
             raise OptionError(f"state = {state!r:.100}: expected the result of state_dict()")

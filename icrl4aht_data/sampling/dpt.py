@@ -114,7 +114,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
             the histories earn at the end. Tasks without measured returns are not checked.
 
     Raises:
-        LabelsMissingError: if a history does not have the labels; names the labels that the selection has.
+        LabelsMissingError: if a history does not have the labels; the message names existing labels.
         OptionError: for impossible options, a selection with observations of several shapes, or contiguous contexts
             longer than some history or than its part selected by `episodes` or `curriculum`.
     """
@@ -230,7 +230,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
 
     @cached_property
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions in the selection sorted by task, int64 (H,), and the start and end of each task in them."""
+        """Positions in the selection sorted by task, int64 (H,), and where each task starts and ends in this order."""
         _, first, task = np.unique(self.dataset.column_codes("task_id"), return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)
         rank[np.argsort(first)] = np.arange(len(first))
@@ -238,7 +238,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         return np.argsort(rank[task], kind="stable"), np.cumsum(sizes) - sizes, np.cumsum(sizes)
 
     # Transitions are the steps whose next observation is stored: all steps in a release with states, otherwise all but
-    # the last one of each episode. They are drawn by number and mapped to steps.
+    # the last one of each episode. A draw is the number of a transition.
 
     def _count_transitions(self, steps: np.ndarray) -> np.ndarray:
         """Return the number of transitions among a history's first `steps` steps."""

@@ -90,7 +90,7 @@ def scale_to_range(random: np.ndarray, n: Any) -> np.ndarray:
 
 
 def weighted_choice(random: np.ndarray, weights: np.ndarray | None, first: Any, stop: Any) -> np.ndarray:
-    """Return positions in first..stop - 1 drawn with probabilities proportional to their weights.
+    """Return positions in first..stop - 1, drawn with probabilities proportional to their weights.
 
     Args:
         random: uint64 (B,), integers below 2**32.
@@ -106,7 +106,7 @@ def weighted_choice(random: np.ndarray, weights: np.ndarray | None, first: Any, 
     edges = np.concatenate([[0.0], np.cumsum(weights, dtype=np.float64)])
     low, high = edges[first], edges[stop]
     position = np.searchsorted(edges, low + random.astype(np.float64) / 2**32 * (high - low), side="right") - 1
-    return np.clip(position, first, np.asarray(stop) - 1).astype(np.int64)  # rounding may exceed the range
+    return np.clip(position, first, np.asarray(stop) - 1).astype(np.int64)  # rounding may give `stop`
 
 
 class HistoryDraws:
@@ -135,7 +135,7 @@ class HistoryDraws:
         # Only histories of releases without states may end within an episode.
         if (ended != self._counts).any() or (selection.has_states and cut.any()):
             raise OptionError(
-                f"some history's episodes do not have {self.kept_steps} steps each; run `icrl4aht-data verify`"
+                f"expected episodes of {self.kept_steps} steps, found other episodes; run `icrl4aht-data verify`"
             )
         if curriculum is not None and not isinstance(curriculum, Curriculum):
             raise OptionError(f"curriculum = {curriculum!r}: expected a Curriculum, such as Curriculum(batches=1000)")

@@ -103,7 +103,7 @@ def parse_json(text: str) -> Any:
         if not level:
             return value
         level = [inner for part in level for inner in (part.values() if isinstance(part, dict) else part)]
-    raise IndexFormatError(f"not JSON as expected: more than {_DEPTH} levels deep")
+    raise IndexFormatError(f"expected JSON of at most {_DEPTH} levels, found more levels")
 
 
 def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
@@ -112,7 +112,7 @@ def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
 
 
 def file_hash(path: Path) -> str:
-    """Return the SHA-256 of a file, hexadecimal."""
+    """Return the SHA-256 of a file as hexadecimal digits."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -127,7 +127,7 @@ def have_hashes(folder: Path, files: Mapping[str, str]) -> bool:
 
 
 def short_hash(data: bytes, digits: int = 16) -> str:
-    """Return the first hexadecimal digits of the SHA-256 of some bytes."""
+    """Return the first hexadecimal digits of the SHA-256 of the given bytes."""
     return hashlib.sha256(data).hexdigest()[:digits]
 
 
@@ -161,7 +161,7 @@ def allocate(stream: BinaryIO, size: int) -> None:
     except (AttributeError, OSError) as error:
         if isinstance(error, OSError) and error.errno not in (errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL):
             raise
-        for start in range(stream.tell(), size, LINE_BYTES):  # for systems that cannot allocate disk space
+        for start in range(stream.tell(), size, LINE_BYTES):  # some systems cannot allocate disk space
             stream.write(bytes(min(LINE_BYTES, size - start)))
         stream.flush()
 
@@ -206,18 +206,18 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
         names: names of the files to write into the folder.
 
     Raises:
-        OptionError: if a file exists without `overwrite`, or a folder or link is in the way.
+        OptionError: if a file exists without `overwrite`, or if there is a folder or link at its path.
     """
     if names is not None and os.path.lexists(path):
         if not path.is_dir():
-            raise OptionError(f"{path}: a file is where a folder is needed; give another folder")
+            raise OptionError(f"{path}: expected a folder, found a file; give another folder")
         if not overwrite and any(path.iterdir()):
-            raise OptionError(f"{path}: exists; give another folder, or replace its files by --overwrite")
+            raise OptionError(f"{path}: exists; give another folder, or use --overwrite to replace its files")
     for file in [path] if names is None else [path / name for name in names]:
         if file.is_symlink() or (file.exists() and not file.is_file()):
-            raise OptionError(f"{file}: a folder or a link is where a file is needed; give another name")
+            raise OptionError(f"{file}: expected a file, found a folder or a link; give another name")
         if file.exists() and not overwrite:
-            raise OptionError(f"{file}: exists; give another name, or replace it by --overwrite")
+            raise OptionError(f"{file}: exists; give another name, or use --overwrite to replace it")
 
 
 def check_folder_content(folder: Path, names: Collection[str], what: str) -> None:
@@ -232,7 +232,7 @@ def check_folder_content(folder: Path, names: Collection[str], what: str) -> Non
         OptionError: if `folder` is not a folder or has other files; the message lists some of the other files.
     """
     if os.path.lexists(folder) and not folder.is_dir():
-        raise OptionError(f"{folder}: a file is where a folder is needed; give another folder")
+        raise OptionError(f"{folder}: expected a folder, found a file; give another folder")
     found = [final_name(path.name) for path in folder.iterdir()] if folder.is_dir() else []
     foreign = sorted(name for name in found if name not in names)
     if foreign:
@@ -319,19 +319,19 @@ def resolve_inside(folder: Path, name: str) -> Path:
     Links from a snapshot folder of the Hub's cache to its blobs are allowed.
 
     Raises:
-        UnsafePathError: if the path leads out of the release, or to neither a file nor a folder.
+        UnsafePathError: if the path points outside the release, or to neither a file nor a folder.
         IndexFormatError: if a folder on the path cannot be read.
     """
     path = folder / name
     if not is_safe_path(name):
-        raise UnsafePathError(f"{folder}: {name[:200]!r} leads out of the release; do not use this release")
+        raise UnsafePathError(f"{folder}: {name[:200]!r} points outside the release; do not use this release")
     allowed = [folder.resolve()]
     if folder.parent.name == "snapshots" and (folder.parent.parent / "blobs").is_dir():
         allowed.append((folder.parent.parent / "blobs").resolve())
     try:
         found = path.resolve()
         if not any(found.is_relative_to(root) for root in allowed):
-            raise UnsafePathError(f"{path}: leads out of the release, to {found}; do not use this release")
+            raise UnsafePathError(f"{path}: points outside the release, to {found}; do not use this release")
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
         return path
@@ -353,7 +353,7 @@ NO_ROOM = (*FULL, errno.EFBIG)
 
 
 def describe_disk(path: Path) -> str:
-    """Return a text with the free space of the disk of a path, which need not exist."""
+    """Return text with the free space of the disk of a path, which need not exist."""
     folder = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists()).resolve()
     disk = next(parent for parent in (folder, *folder.parents) if parent.is_mount() or parent == parent.parent)
     usage = shutil.disk_usage(folder)

@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
-    """Return key -> list of the items with this key, in the given order; keys are in order of first appearance."""
+    """Return lists of items with equal keys, by key; items keep their order, keys are in order of first appearance."""
     groups: dict[K, list[T]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)

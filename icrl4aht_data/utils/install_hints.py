@@ -74,6 +74,6 @@ def missing_library(module: str) -> str | None:
 
 
 def _extra(module: str) -> str:
-    """Return the name of the extra that installs a module; an empty text if no extra does."""
+    """Return the name of the extra that installs a module; an empty string if no extra does."""
     top = module.partition(".")[0].lower()
     return EXTRAS.get(_DISTRIBUTIONS.get(top, top), "")

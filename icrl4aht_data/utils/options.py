@@ -55,7 +55,7 @@ class Option(NamedTuple):
 
 @cache
 def option_hints(kind: type) -> dict[str, Any]:
-    """Return field name -> annotation, for the fields of a dataclass that are options."""
+    """Return the annotations of those fields of a dataclass that are options, by field name."""
     hints = get_type_hints(kind, include_extras=True)
     return {name: hint for name, hint in hints.items() if any(isinstance(part, Option) for part in get_args(hint))}
 

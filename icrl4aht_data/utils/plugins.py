@@ -47,7 +47,7 @@ class Plugins:
 
     @property
     def packages(self) -> dict[str, str]:
-        """Registered name -> name and version of the package that registers this name.
+        """Name and version of the package that registers each object, by the registered name.
 
         Raises:
             PluginError: if names collide or are invalid, see `names`.
@@ -62,7 +62,7 @@ class Plugins:
             kind: the expected class of the object, or `Callable`.
 
         Raises:
-            PluginError: if the object cannot be imported or has another class; names the package and the entry point.
+            PluginError: if the object cannot be imported or has another class; the message names the entry point.
         """
         if name not in self._loaded:
             try:

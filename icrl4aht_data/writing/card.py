@@ -149,7 +149,7 @@ class _TaskFacts:
 
 
 def card_facts(root: Path) -> dict[str, Any]:
-    """Return the facts for the dataset card of a release: values, and lists of rows for tables.
+    """Return the values that the dataset card of a release shows, and lists of rows for its tables.
 
     Args:
         root: a release folder; the card and the manifest need not exist yet.
@@ -222,7 +222,7 @@ def _mean(values: Iterable[float]) -> float:
 
 
 def _span(values: Iterable[float]) -> str:
-    """Return the range of values as text, such as "3" or "3 to 5"; an empty text for no values."""
+    """Return the range of values as text, such as "3" or "3 to 5"; an empty string for no values."""
     found = list(values)
     ends = [f"{end:z,.0f}" for end in (min(found), max(found))] if found else []
     return " to ".join(dict.fromkeys(ends))
@@ -242,7 +242,7 @@ def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str,
 
 
 def _learning_rows(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return one row on the rise of returns for each layout title, source and split, sorted by these."""
+    """Return a row on the rise of returns for each layout title, source and split, in this order."""
     names = ("layout", "source", "split")
     order = [*titles, *SOURCES, *(task.first.source for task in tasks), *SPLITS]  # sources not in SOURCES come last
     ordered = sorted(tasks, key=lambda task: [order.index(getattr(task.first, name)) for name in names])
@@ -272,7 +272,7 @@ def _curve_rows(learning: Iterable[Mapping[str, Any]], sources: Iterable[str]) -
 
 
 def _teammate_rows(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict[str, Any]]:
-    """Return a row of facts for each teammate of a release, sorted by layout, split and family."""
+    """Return a table row for each teammate of a release, sorted by layout, split and family."""
     known = (one for one in tasks if one.task is not None)
     rows = []
     for own in grouped(known, lambda one: one.task and (*one.task.teammate_key, one.task.split)).values():
@@ -294,11 +294,11 @@ def _teammate_rows(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[
         )
     order = {name: number for number, name in enumerate((*layouts, *SPLITS))}
 
-    def place(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    def sort_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
         family = row["family"]
         return order[row["layout"]], order[row["split"]], family == "rl", family_order(family)
 
-    return sorted(rows, key=place)
+    return sorted(rows, key=sort_key)
 
 
 def _behaviour_counts(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
@@ -421,7 +421,7 @@ def _distinct_values(tasks: Iterable[_TaskFacts], name: str) -> list[Any]:
 
 
 def _generation_facts(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
-    """Return facts about the generation of the histories: egos, stream filters, noise schedules, versions."""
+    """Return how the histories were generated: egos, stream filters, noise schedules, versions."""
     noise = {json.dumps([task.made.source, task.made.noise]): task.made for task in tasks if task.made.noise}
     labels = {"profile": "profile", "code_version": "icrl4aht-data", "jax_version": "JAX", "platform": "platform"}
     versions = {label: ", ".join(map(str, _distinct_values(tasks, name))) for name, label in labels.items()}

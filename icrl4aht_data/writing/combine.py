@@ -22,7 +22,7 @@ def combine_releases(
     *,
     overwrite: bool = False,
 ) -> Path:
-    """Combine releases, or selections of their histories, into one release with histories numbered anew in order.
+    """Combine releases, or selections of their histories, into one release whose histories are numbered from 0.
 
     As in new releases, a task's oracle actions are left out if the oracle earns less than the histories at their end.
 

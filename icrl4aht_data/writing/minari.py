@@ -8,7 +8,7 @@ truncated after the last stored step. `infos` has arrays of n + 1 rows, one for 
     teammate_action  int8 (n + 1,), the teammate's action that led to the observation; -1 in the first row
     expert_action, oracle_action   int8 (n + 1,), labels, if the history has labels; -1 in the last row
 
-The metadata key `icrl4aht` has the facts that Minari has no field for: data version, tasks, provenance, and the task,
+The metadata key `icrl4aht` has the values that Minari has no field for: data version, tasks, provenance, and the task,
 source, stream, learner and number of episodes of every history. Checkpoints are not converted.
 """
 
@@ -123,7 +123,7 @@ def _metadata(dataset: Dataset) -> dict[str, Any]:
 
 
 def _environment_spec(dataset: Dataset, tasks: list[dict[str, Any]], canonical: bool) -> Any:
-    """Return the environment spec of a selection with one task and one heuristic teammate; None for others."""
+    """Return the environment spec of a selection with one task and one heuristic teammate; else None."""
     swaps = any(entry.teammate_of_episode for entry in dataset.entries)
     if len(tasks) > 1 or tasks[0]["teammate"]["kind"] == "rl" or swaps:
         return None

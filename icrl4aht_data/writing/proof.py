@@ -36,15 +36,15 @@ def read_proof(root: Path) -> dict[str, Any] | None:
 
 
 def proof_table(proof: Mapping[str, Any]) -> str:
-    """Return a Markdown table of the models' mean returns, with the histories used and the range over trainings."""
+    """Return a Markdown table of the models' mean returns, with the histories used and the range over training runs."""
     rows = [
-        [one["histories"], one["learner"], str(len(one["seeds"])), *(_with_range(one[key], key) for key in _COLUMNS)]
+        [one["histories"], one["learner"], str(len(one["seeds"])), *(_mean_text(one[key], key) for key in _COLUMNS)]
         for one in proof["models"]
     ]
     return markdown_table(["histories", "model", "trainings", *_COLUMNS.values()], rows, right=1 + len(_COLUMNS))
 
 
-def _with_range(values: Sequence[float], key: str) -> str:
+def _mean_text(values: Sequence[float], key: str) -> str:
     digits = 2 if key == "share" else 1
     ends = f" ({min(values):z.{digits}f} to {max(values):z.{digits}f})" if len(values) > 1 else ""
     return f"{sum(values) / len(values):z.{digits}f}{ends}"

@@ -236,7 +236,7 @@ def _wrap_errors(what: str) -> Iterator[None]:
 
 def _with_padding_note(provenance: Provenance, history: _PublishedHistory) -> Provenance:
     """Return provenance with a note about padded views if the history's observations have to be padded."""
-    if not (history.short and history.kind == OBSERVATIONS):
+    if not (history.needs_padding and history.kind == OBSERVATIONS):
         return provenance
     rows = get_layout(history.line["layout"]).height
     notes = {"obs_shape": history.line["obs_shape"], "padding": PADDING.format(rows=rows)}
@@ -296,7 +296,7 @@ class _PublishedHistory:
         return f"{self.file.filename}, group {self.line['h5_group']}"
 
     @property
-    def short(self) -> bool:
+    def needs_padding(self) -> bool:
         """Whether the observations have fewer than 5 rows and need padding, see `published_views`."""
         return has_missing_rows(get_layout(self.line["layout"]), self.line["obs_shape"])
 
@@ -330,10 +330,10 @@ class _PublishedHistory:
             PublishedFormatError: if the array is invalid; the message has its name, and what was expected and found.
         """
         layout, steps = get_layout(self.line["layout"]), self.line["T"]
-        if name == "obs" and self.short and self.kind != OBSERVATIONS:  # state records have the missing rows
+        if name == "obs" and self.needs_padding and self.kind != OBSERVATIONS:  # rendered from states, without padding
             return fast_observe(layout, self.read("state"), np.empty((steps, *layout.obs_shape), np.uint8))
         array = self._read_recorded(name)
-        if name == "obs" and self.short:
+        if name == "obs" and self.needs_padding:
             try:
                 return complete_views(layout, array)
             except PublishedFormatError as error:
@@ -355,7 +355,7 @@ class _PublishedHistory:
         """Return one array as recorded, without padding of observations, in the field's compact dtype."""
         field, layout, steps = FIELDS[name], get_layout(self.line["layout"]), self.line["T"]
         rows = steps if field.axis == "T" else steps // self.kept_steps
-        shape = self.line["obs_shape"] if name == "obs" and self.short else field.memory_dtype(layout).shape
+        shape = self.line["obs_shape"] if name == "obs" and self.needs_padding else field.memory_dtype(layout).shape
         with _wrap_errors(f"{self.where}: {name}: {steps} steps on {layout.name}"):
             found = read_dataset(find_node(self.file, f"{self.line['h5_group']}/{name}"), (rows, *shape))
         return self._to_compact(name, found)

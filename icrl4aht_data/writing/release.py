@@ -131,7 +131,7 @@ def write_release(
         shard_histories: maximum number of histories in a shard.
         shard_bytes: intended size of a shard in bytes; sizes are estimated from the first history of each layout.
         overwrite: whether to replace a release at `target` if its folder has no other files.
-        sources: folders that the tasks are read from; they may be neither inside nor around `target`.
+        sources: folders that the tasks are read from; they may neither be inside `target` nor contain it.
         done: function called with a task after the task's histories are written.
 
     Raises:
@@ -146,7 +146,7 @@ def write_release(
     new = list(tasks)
     ids = [task.task.task_id for task in new]
     if not new or len(set(ids)) < len(ids):
-        raise OptionError(f"expected at least one task and no task twice, found {ids}")
+        raise OptionError(f"expected at least one task, and each task once, found {ids}")
     if empty := [task.task.task_id for task in new if task.streams < 1]:
         raise OptionError(f"task {empty[0]} has no histories; add at least one history, or leave the task out")
     named = [task.task.task_id for task in new if isinstance(task.task, NamedTask)]
@@ -166,7 +166,7 @@ def write_release(
         with (root / HISTORIES).open("w", encoding="utf-8") as stream:
             stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in writer.entries)
         named_layouts = [*(one.task.layout_name for one in new), *(one.layout for one in left_out)]
-        write_layouts_file(root / LAYOUTS_FILE, map(get_layout, named_layouts))  # without the recipes of tasks
+        write_layouts_file(root / LAYOUTS_FILE, map(get_layout, named_layouts))  # not the tasks' recipes
         known = [] if named else [one.task for one in new]
         write_tasks(root / TASKS, known)
         provenance = ProvenanceByTask((one.task.task_id, one.provenance) for one in new)
@@ -239,7 +239,7 @@ class _ShardWriter:
             )
         needed = {field.name for field in memory_fields(self.kind) if self.kind not in field.optional}
         if not needed <= arrays.keys():
-            raise OptionError(f"task {task.task_id}: a history lacks the arrays {sorted(needed - arrays.keys())}")
+            raise OptionError(f"task {task.task_id}: a history does not have arrays {sorted(needed - arrays.keys())}")
         dones = arrays["dones"]
         unfinished = len(dones) % self.kept_steps if self.kind in KINDS else len(dones) < self.kept_steps
         if unfinished or not np.array_equal(dones, episode_ends(len(dones), self.kept_steps)):

@@ -65,7 +65,7 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
                     shutil.rmtree(leftover, ignore_errors=True)
                 try:
                     new.mkdir()
-                    with explain_full_disk(target):  # here too, to measure the free space before `new` is removed
+                    with explain_full_disk(target):  # measures the free space before `new` is removed
                         yield new
                     check_target(target, overwrite, sources)
                     _replace(target, new, old)
@@ -84,7 +84,7 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
     Args:
         target: the folder to write.
         overwrite: whether to allow replacing a release, or a folder of converted files, that has no other files.
-        sources: folders to read from; none may be the target, or be inside or around the target.
+        sources: folders to read from; none may be the target, be inside it, or contain it.
 
     Returns:
         Whether the target exists and will be replaced.
@@ -103,7 +103,7 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
     if not os.path.lexists(target) or (resolved.is_dir() and not any(resolved.iterdir())):
         return False
     if not overwrite:
-        raise OptionError(f"{target}: exists; give another folder, or replace it by --overwrite")
+        raise OptionError(f"{target}: exists; give another folder, or use --overwrite to replace it")
     if fault := _foreign_content(resolved):
         raise OptionError(
             f"{target} {fault}; --overwrite replaces only releases and converted files: remove the folder, or give "

@@ -44,8 +44,8 @@ def release(tmp_path_factory) -> Path:
     return root
 
 
-def evaluation_of(last: float, last_cleared: float):
-    """Return a replacement of `evaluate`: a model earns 0 in the first episode, then `last` plus the seed."""
+def fake_evaluate(last: float, last_cleared: float):
+    """Return a replacement for `evaluate` with invented returns: 0 in the first episode, then `last` plus the seed."""
 
     def evaluate(agent, make, tasks, protocol, *, seeds, out, details, played, control=None):
         name = agent if control is None else controlled_name(agent, control)
@@ -67,7 +67,7 @@ def evaluation_of(last: float, last_cleared: float):
     [(20.0, 0.0, "rises by"), (20.0, 20.0, "does not rise by"), (-10.0, -30.0, "does not rise by")],
 )
 def test_conclusion_says_whether_memory_raises_the_return(last, last_cleared, verdict, tmp_path):
-    evaluate = evaluation_of(last, last_cleared)
+    evaluate = fake_evaluate(last, last_cleared)
     for control in (None, "cleared"):
         out = tmp_path / str(control)
         evaluate(
@@ -80,7 +80,7 @@ def test_conclusion_says_whether_memory_raises_the_return(last, last_cleared, ve
 
 def test_demo_prints_every_step_and_writes_all_files(release, tmp_path, monkeypatch):
     """The model is really trained, but results of its evaluation are invented."""
-    monkeypatch.setattr(results, "evaluate", evaluation_of(20.0, 0.0))
+    monkeypatch.setattr(results, "evaluate", fake_evaluate(20.0, 0.0))
     monkeypatch.setattr(demo, "DEMO_LAYOUT", "demo_wide")
     text = StringIO()
     page = demo.run_demo(tmp_path, Console(file=text, width=300), replace(SETTINGS, root=release))

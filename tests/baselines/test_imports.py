@@ -28,7 +28,7 @@ except ValueError as error:
 
 
 def test_main_functions_are_imported_from_the_package_without_jax():
-    """The program evaluates nothing, because compiling takes seconds."""
+    """The program stops at an unknown protocol, since compiling an evaluation takes seconds."""
     assert run_python("-c", USE).startswith("unknown protocol 'publishd'; valid: published, ")
 
 

@@ -26,7 +26,7 @@ def release(tmp_path_factory) -> Path:
 
 
 def small_options(root: Path) -> ProofOptions:
-    """Return options of tiny trainings on a release, with one validation task of each track."""
+    """Return options of tiny training runs on a release, with one validation task of each track."""
     tasks = {track: (bundled_tasks(track, "validation")[0],) for track in ("preference", "teammate")}
     return ProofOptions(str(root), steps=2, batch_size=2, context=20, tasks=tasks)
 
@@ -50,7 +50,7 @@ def test_proof_table_has_mean_and_range_over_finished_trainings(release, tmp_pat
     path = write_proof(jobs, earned, tmp_path / "proof.json")
     content = json.loads(path.read_text())
     assert content["histories_sha256"] == file_hash(release / HISTORIES)
-    assert content["models"][0]["share"] == [0.25, 0.5]  # returns are 5 and 10 above `stay`, that of rl2-reference 20
+    assert content["models"][0]["share"] == [0.25, 0.5]  # the models earn 5 and 10, and rl2-reference earns 20
     spreads = ["-2.0 (-2.0 to -2.0)", "15.0 (10.0 to 20.0)", "-2.0 (-2.0 to -2.0)", "-1.0 (-1.0 to -1.0)"]
     spreads += ["0.38 (0.25 to 0.50)", "20.0 (20.0 to 20.0)"]
     assert " | ".join(["| all | AD, expert labels | 2", *spreads]) in proof_table(content)

@@ -1,4 +1,4 @@
-"""Reference models: training recipes, the steps that make the models, and resume."""
+"""Reference models: training recipes, the steps that make the models, and resumed commands."""
 
 from __future__ import annotations
 
@@ -53,9 +53,7 @@ def test_recipes_match_the_settings_of_the_bundled_models():
 
 
 def test_reference_command_rejects_unknown_names(tmp_path):
-    with pytest.raises(
-        OptionError, match=r"rl2-reference learns from no histories.*ad-reference, dpt-reference, ad-rising"
-    ):
+    with pytest.raises(OptionError, match=r"rl2-reference does not learn from.*ad-reference, dpt-reference, ad-rising"):
         reference.check_learns_from_teacher("rl2-reference")
     command = ["research", "reference", "--name", "rl2-reference", "--out", str(tmp_path / "out"), "--teacher"]
     assert "unknown agent" in run_cli(*command, "rl2-referenc", code=2) and not (tmp_path / "out").exists()
@@ -75,7 +73,7 @@ def test_reference_model_is_bundled_with_all_tracks(tmp_path, monkeypatch):
     assert copied == [("rl2-reference", "layout"), ("rl2-reference", "teammate")]
     assert [found.track for found in cards[0]] == ["teammate", "layout"]
     printed = run_cli(*command, "--track", "layout", code=2)
-    assert "expected one --name of all tracks" in " ".join(printed.split())
+    assert "expected one --name, all tracks" in " ".join(printed.split())
 
 
 def test_card_of_a_reference_model_shows_command_and_training_curves(tmp_path, monkeypatch):
@@ -83,11 +81,11 @@ def test_card_of_a_reference_model_shows_command_and_training_curves(tmp_path, m
     config = {"method": "ad", "model": {}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
     trained = {"config": config, "manifest_sha256": "ab12", "run_hash": "1"}
 
-    def evaluated(folder: Path) -> EvaluationRun:
+    def invented_run(folder: Path) -> EvaluationRun:
         run = evaluated_run("ad-reference", ("cramped_down",) if "layout" in folder.parts else ("demo_wide",))
         return dataclasses.replace(run, sources=(run.sources[0]._replace(trained=trained, folder=str(folder)),))
 
-    monkeypatch.setattr(reference, "read_run", evaluated)
+    monkeypatch.setattr(reference, "read_run", invented_run)
     for track in TRACKS:
         (tmp_path / "ad-x" / track).mkdir(parents=True)
     (tmp_path / "ad-x" / "layout" / "curves.png").write_bytes(b"")

@@ -93,7 +93,7 @@ def test_batch_that_does_not_fit_in_memory_is_split(monkeypatch):
     measure = partial(measure_training, size="small", encoder="paper", dtype="float32")
     assert measure(FULL_SIZES) == {"accumulate": 4}
     assert tried == [1, 2, 4]
-    with pytest.raises(MemoryError, match="no number of parts fits: RESOURCE_EXHAUSTED"):
+    with pytest.raises(MemoryError, match="the batch does not fit in any number of parts: RESOURCE_EXHAUSTED"):
         measure(SMALL_SIZES)  # a batch of 2 rows has at most 2 parts
 
 
@@ -118,10 +118,10 @@ def test_training_steps_of_models_can_be_lowered_for_cuda(case):
     trainer = Trainer(method, TrainOptions(batch_size=FULL_SIZES.batch, context=length))
     batch = dataset.ad(batch_size=1, length=length, seed=0)[0]
 
-    def of_full_size(leaf: Any) -> jax.ShapeDtypeStruct:
+    def full_batch_shape(leaf: Any) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((FULL_SIZES.batch, *leaf.shape[1:]), leaf.dtype)
 
-    traced = trainer.step.trace(trainer.state_like(), jax.tree.map(of_full_size, batch))
+    traced = trainer.step.trace(trainer.state_like(), jax.tree.map(full_batch_shape, batch))
     traced.lower(lowering_platforms=("cuda",))
     assert product_flops(traced.jaxpr) > 1e5 * FULL_SIZES.batch * length
 

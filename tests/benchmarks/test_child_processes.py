@@ -23,12 +23,12 @@ for case in sys.argv[1:]:
 
 
 def run(*cases: str, seconds: float = 30, case_seconds: float = 20) -> tuple[int, dict]:
-    """Run benchmark cases; return the number of failures and the printed facts of each case."""
+    """Run benchmark cases; return the number of failures and the printed values of each case."""
     found = {}
 
-    def note(case, facts):
+    def note(case, values):
         assert case not in found
-        found[case] = facts
+        found[case] = values
 
     failures = run_isolated(
         cases,

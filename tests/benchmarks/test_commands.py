@@ -76,7 +76,7 @@ def main(config):
 @pytest.mark.slow
 def test_jaxmarl_script_is_run_with_both_environments(tmp_path, monkeypatch):
     """A small script replaces JaxMARL's training script, which JaxMARL's package does not contain."""
-    monkeypatch.setattr("jaxmarl.make", None)  # so that monkeypatch restores it after the test
+    monkeypatch.setattr("jaxmarl.make", None)  # monkeypatch restores `jaxmarl.make` after the test
     script = tmp_path / "ippo.py"
     script.write_text(SCRIPT)
     options = ["--layout", "cramped_up", "--environments", "2", "--rollout", "4", "--rounds", "1", "--peer", script]

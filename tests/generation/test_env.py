@@ -48,13 +48,13 @@ class Compiled(NamedTuple):
     step: jax.stages.Wrapped
 
     @classmethod
-    def of(cls, env: Environment) -> Compiled:
+    def jit(cls, env: Environment) -> Compiled:
         return cls(env, jax.jit(env.init), jax.jit(env.step))
 
 
 @pytest.fixture(scope="module")
 def cramped() -> Compiled:
-    return Compiled.of(Environment(CRAMPED, max_steps=MAX_STEPS))
+    return Compiled.jit(Environment(CRAMPED, max_steps=MAX_STEPS))
 
 
 def some_keys(number: int) -> jax.Array:
@@ -62,7 +62,7 @@ def some_keys(number: int) -> jax.Array:
 
 
 def move_to_goal(state: EnvState) -> EnvState:
-    """Change environments on cramped_up: the teammate faces the goal with a dish of the current recipe."""
+    """Return environments on cramped_up in which the teammate faces the goal with a dish of the current recipe."""
     where, recipes = columns(CRAMPED), fields(CRAMPED, state.record).recipe
     records = np.repeat(state_record(CRAMPED, (1, 1, "up"), (3, 2, "down")), len(recipes), axis=0)
     records[:, where.recipe] = recipes
@@ -155,7 +155,7 @@ def test_episodes_end_exactly_after_max_steps(batch_steps):
 
 def test_final_state_follows_the_rules_even_if_the_episode_ends(batch_steps):
     for state, step, actions in zip(batch_steps.before, batch_steps.steps, batch_steps.actions, strict=True):
-        recipes = np.asarray(step.final)[:, columns(CRAMPED).recipe]  # the drawn recipes
+        recipes = np.asarray(step.final)[:, columns(CRAMPED).recipe]  # recipes drawn by the environment
         expected = rules.step(CRAMPED, np.asarray(state.record), actions, recipes)
         np.testing.assert_array_equal(step.final, expected.state)
         np.testing.assert_array_equal(step.reward, expected.reward)
@@ -196,7 +196,7 @@ def test_single_environment_equals_an_environment_in_a_batch(cramped, keys, acti
     assert_equal_steps(alone.steps, batch_steps.steps, which)
 
 
-def test_environment_does_not_depend_on_position_or_others_in_batch(cramped, keys, actions, batch_steps):
+def test_results_of_an_environment_do_not_depend_on_its_batch(cramped, keys, actions, batch_steps):
     others = some_keys(2)
     mixed = jnp.concatenate([others[: N // 2], keys[: N // 2][::-1]])
     theirs = np.concatenate([actions[:, N // 2 :], actions[:, : N // 2][:, ::-1]], axis=1)
@@ -241,7 +241,7 @@ def test_recipe_changes_only_after_correct_deliveries(batch_steps):
 
 
 def test_custom_recipes_are_drawn_at_starts_and_after_deliveries():
-    four = Compiled.of(Environment(CRAMPED, max_steps=MAX_STEPS, recipes=FOUR_RECIPES))
+    four = Compiled.jit(Environment(CRAMPED, max_steps=MAX_STEPS, recipes=FOUR_RECIPES))
     np.testing.assert_array_equal(four.env.recipe_items, FOUR_RECIPES)
     np.testing.assert_array_equal(Environment(CRAMPED).recipe_items, [3 * ZERO, 3 * ONE])
     started = fields(CRAMPED, four.init(some_keys(4)).record).recipe

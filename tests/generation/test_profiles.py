@@ -41,7 +41,7 @@ presets = ["default", "high_inertia"]
 
 @pytest.fixture
 def changed(tmp_path) -> Callable[[str, str], str]:
-    """Return the path of a profile file with one text replaced by another."""
+    """Return a function that replaces a string in a profile and returns the path of the written file."""
 
     def write(old: str, new: str) -> str:
         assert VALID.count(old) == 1
@@ -326,16 +326,16 @@ def test_unknown_profile_name_raises_error():
 
 
 def test_task_id_depends_on_every_field_of_the_task():
-    def hashed(track="teammate", split="train", layout="demo_cook_wide", preset="default", theta_id=0, seed=0) -> str:
+    def suffix(track="teammate", split="train", layout="demo_cook_wide", preset="default", theta_id=0, seed=0) -> str:
         teammate = heuristic_teammate("utility_greedy", preset, theta_id)
         return task_id(Task("", track, split, layout, seed, teammate))[-8:]
 
-    others = [hashed("layout"), hashed(split="test"), hashed(layout="demo_cook_simple"), hashed(preset="high_inertia")]
-    others += [hashed(theta_id=1), hashed(seed=1)]
-    assert len({hashed(), *others}) == 7
+    others = [suffix("layout"), suffix(split="test"), suffix(layout="demo_cook_simple"), suffix(preset="high_inertia")]
+    others += [suffix(theta_id=1), suffix(seed=1)]
+    assert len({suffix(), *others}) == 7
 
 
-def test_tasks_accept_both_names_of_a_layout_but_only_of_their_track():
+def test_tasks_accept_short_and_long_names_of_layouts_of_their_track_only():
     teammate = heuristic_teammate("utility_greedy", "default", 0)
     short, long = (make_task("teammate", "train", name, teammate, 0) for name in ("coord_ring", "grounded_coord_ring"))
     assert short == long

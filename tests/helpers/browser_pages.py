@@ -20,7 +20,7 @@ def embedded(html: bytes) -> tuple[dict[str, Any], list[bytes]]:
 
 
 def episodes(index: dict[str, Any], facts: dict[str, Any], content: bytes) -> dict[int, dict[str, np.ndarray]]:
-    """Return the frames of each shown episode: number -> "state" uint8 (frames, S) and the other columns."""
+    """Return the columns of each shown episode, by episode number and name; "state" is uint8 (frames, S)."""
     size, names = index["layouts"][facts["layout"]]["record_size"], facts["columns"]
     columns = np.frombuffer(content, np.uint8).reshape(size + len(names), sum(facts["frames"]))
     named = {"state": columns[:size].T, **dict(zip(names, columns[size:], strict=True))}

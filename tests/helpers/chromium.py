@@ -58,7 +58,7 @@ def wait_until(page: Any, condition: str, seconds: float = 30) -> None:
 
 
 def check_phone(page: Any, dark: bool) -> None:
-    """Check that a page does not scroll sideways on a phone, and that its background is dark if `dark` is true."""
+    """Assert that a page fits the width of a phone, and that its background is dark if and only if `dark` is set."""
     assert page.evaluate("document.documentElement.scrollWidth") == PHONE
     shade = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
     assert (max(shade) < 60) is dark

@@ -41,7 +41,7 @@ def write_package(
 
 @contextmanager
 def installed(*folders: Path) -> Iterator[None]:
-    """Put folders of `write_package` on this process's Python path for a while, and find all plugins again."""
+    """Put folders of `write_package` on this process's Python path within a context, and find all plugins again."""
     with ExitStack() as stack:
         stack.enter_context(mock.patch.object(sys, "path", [*map(str, folders), *sys.path]))
         for plugins in (LAYOUT_PLUGINS, TEAMMATE_PLUGINS, METHOD_PLUGINS):

@@ -86,7 +86,7 @@ def load_batch(root, layout="demo_wide", **options):
     return load_icrl4aht(root, layout=layout, **options).ad(batch_size=8, length=30)[0]
 
 
-def shards_in(folder: Path) -> set[str]:
+def shard_names(folder: Path) -> set[str]:
     return {path.name for path in (folder / "data").rglob("*.h5")}
 
 
@@ -108,10 +108,10 @@ def test_a_remote_release_equals_its_local_copy(kind, lite, monkeypatch):
         remote = load_icrl4aht(url)
         assert [h.entry for h in remote] == [h.entry for h in local]
         assert remote.info == local.info and remote.recover_teammate(3) == local.recover_teammate(3)
-        assert not shards_in(remote.root), "opening fetches the index only"
+        assert not shard_names(remote.root), "opening fetches the index only"
         one = remote.filter(layout="demo_wide")
         assert np.array_equal(one[0].expert_actions, local.filter(layout="demo_wide")[0].expert_actions)
-        assert len(shards_in(remote.root)) == 1, "a shard is fetched when one of its histories is read"
+        assert len(shard_names(remote.root)) == 1, "a shard is fetched when one of its histories is read"
         assert_equal(load_batch(pickle.loads(pickle.dumps(one)).origin.folder), load_batch(lite[0]))
         for cache in ("auto", "ram", "mmap", "stream"):
             assert_equal(load_batch(url, "coord_simple", cache=cache), load_batch(lite[0], "coord_simple"))
@@ -215,7 +215,7 @@ def test_download_refuses_folders_with_other_content(lite, full, tmp_path):
         assert [path.name for path in target.iterdir()] == [".bashrc"]
         shutil.rmtree(target)
         shutil.copytree(full[0], target)
-        with pytest.raises(OptionError, match="contains another release or version"):
+        with pytest.raises(OptionError, match="contains a release that differs"):
             plan_download(server.url, to=target)
     assert contents(target) == contents(full[0])
 
@@ -245,7 +245,7 @@ def test_killed_download_resumes_with_the_missing_files(kind, to, lite, tmp_path
         server.faults.clear()
         plan = plan_download(url, to=tmp_path / to if to else None)
         folder = plan.root.folder
-        assert not shards_in(folder), "no shard under its name"
+        assert not shard_names(folder), "no shard under its name"
         assert len(plan.absent) < len(plan.files) - 4, "complete files are kept"
         fetch_planned(plan)
         assert contents(folder).items() >= contents(lite[0]).items()
@@ -285,7 +285,7 @@ def test_permanent_server_errors_are_raised_with_the_file_name(kind, fault, lite
                 use()
             assert ".h5: " in str(caught.value), "the message names the file"
         assert time.monotonic() - began < 5
-        assert not shards_in(tmp_path / "mine") and not shards_in(load_icrl4aht(url).root)
+        assert not shard_names(tmp_path / "mine") and not shard_names(load_icrl4aht(url).root)
         assert not list((tmp_path / "mine").glob(".partial-*"))
         server.faults.clear()
         seen = len(server.log)

@@ -1,4 +1,4 @@
-"""Test the `repr` of objects, and run a script as users would write."""
+"""Test the `repr` of objects, and run an example of a user's script."""
 
 from __future__ import annotations
 

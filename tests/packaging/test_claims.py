@@ -58,7 +58,7 @@ def entries() -> tuple[Entry, ...]:
     return tuple(read_index(MINI).entries)
 
 
-def rising_entries() -> tuple[float, ...]:
+def count_rising_entries() -> tuple[float, ...]:
     rising = [entry for entry in entries() if entry.return_end - entry.return_start >= LEAST_HEADROOM]
     return len(rising), len(entries()), LEAST_HEADROOM
 
@@ -70,18 +70,18 @@ def count_best_responses() -> tuple[int, int]:
     return len(found), len({one.layout for one in found})
 
 
-def cells_without_headroom() -> tuple[int, int]:
+def count_cells_without_headroom() -> tuple[int, int]:
     cells = read_headroom("published").values()
     return sum(not has_headroom(cell) for cell in cells), len(cells)
 
 
 def bundled_tasks(split: str, kind: Literal["", "diverse"] = "") -> list[Task]:
-    """Return the bundled tasks of a split of both tracks."""
+    """Return the bundled tasks of one split in both tracks."""
     return [task for track in TRACKS for task in read_tasks(manifest_path(track, split, kind))]
 
 
 def paper_plan_sizes() -> tuple[float, ...]:
-    """Return learners, environment steps, recorded and kept transitions of the profile `paper`."""
+    """Return the numbers of learners, environment steps, recorded and kept transitions in profile `paper`."""
     profile = load_profile("paper")
     ego, count = profile.ego, sum(profile.tasks_on(name, "ppo") for name in profile.layouts)
     steps = ego.episodes * KEPT_STEPS
@@ -132,15 +132,15 @@ def bundled_release_size() -> tuple[int, ...]:
 
 
 CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
-    ("README", "return of {} of the {} bundled histories rises by at least {} from", rising_entries),
+    ("README", "return of {} of the {} bundled histories rises by at least {} from", count_rising_entries),
     ("README", "{} histories of {} tasks on {} layouts: {} steps in {} MB", bundled_release_size),
     ("README", "a delivery is worth {}.", lambda: DELIVERY_REWARD),
-    ("README", "more than `stay` in {} of the {} cells", cells_without_headroom),
+    ("README", "more than `stay` in {} of the {} cells", count_cells_without_headroom),
     ("docs/index", "benchmark's {} test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/evaluating", "There are {} published test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/evaluating", "of {} episodes with {} steps each", lambda: (SEEDED.episodes, SEEDED.steps)),
     ("docs/evaluating", "canonical channels, the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
-    ("docs/evaluating", "more than `stay` in {} of the {} cells", cells_without_headroom),
+    ("docs/evaluating", "more than `stay` in {} of the {} cells", count_cells_without_headroom),
     ("docs/protocol", "choices.md): up to {} [drawn", most_validation_tasks_of_a_layout),
     ("docs/protocol", "scripts of {} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),
     ("docs/protocol", "{} of its modes do not cooperate", count_uncooperative_modes),

@@ -230,7 +230,7 @@ def stored_type(field: Field, kind: Kind) -> str:
 
 
 SMALL = "--steps 3 --width 16 --heads 2 --batch-size 2 --context 40"
-"""Options of a training that takes seconds."""
+"""Options of a training run that takes seconds."""
 
 
 def write_example_package(folder: Path) -> Path:

@@ -25,7 +25,7 @@ verified_once = functools.cache(verify_release)
 
 @pytest.fixture
 def doctor_folder(tmp_path, monkeypatch) -> Path:
-    """Set new cache and data folders and a fixed answer for JAX; return the parent of the folders."""
+    """Set new cache and data folders and a fixed list of JAX devices; return the parent of both folders."""
     for name in ("CACHE", "DATA"):
         monkeypatch.setenv(f"ICRL4AHT_{name}_DIR", str(tmp_path / name.lower()))
     for name in ("ICRL4AHT_OFFLINE", "HF_HUB_OFFLINE", "ICRL4AHT_REMOTE", "ICRL4AHT_CACHE_BYTES"):
@@ -36,7 +36,7 @@ def doctor_folder(tmp_path, monkeypatch) -> Path:
 
 
 def run_doctor(code: int = 0) -> tuple[dict[str, Any], str]:
-    """Run the doctor, which must exit with `code`; return the JSON facts and the printed text."""
+    """Run `doctor`, which must exit with `code`; return its output as parsed JSON and as text."""
     text, facts = run_cli("doctor", code=code), json.loads(run_cli("doctor", "--json", code=code))
     assert code == bool(facts["problems"]) == (not facts["ok"])
     for each in facts["problems"]:
@@ -45,7 +45,7 @@ def run_doctor(code: int = 0) -> tuple[dict[str, Any], str]:
 
 
 def reported_problems() -> dict[str, str]:
-    """Run the doctor, which must find problems; return problem -> next step."""
+    """Run `doctor`, which must find problems; return the next step for each problem."""
     return {each["problem"]: each["next_step"] for each in run_doctor(1)[0]["problems"]}
 
 
@@ -140,7 +140,7 @@ def test_install_hints_name_extras_that_contain_the_package(doctor_folder):
 
 
 def test_doctor_shows_offline_mode_and_an_unused_gpu(doctor_folder, monkeypatch):
-    """Offline mode and a GPU that JAX does not use are shown, but are no problems."""
+    """`doctor` shows offline mode and a GPU that JAX does not use, but reports no problem."""
     monkeypatch.setenv("ICRL4AHT_OFFLINE", "1")
     monkeypatch.setattr(shutil, "which", lambda name: name)
     facts, text = run_doctor()

@@ -51,7 +51,7 @@ def test_every_command_has_complete_help(words):
 
 
 def test_help_of_the_program_imports_no_command():
-    """Without commands and JAX, help takes less than half a second of CPU time on one core, mostly for NumPy."""
+    """If no commands and no JAX are imported, help takes less than 0.5 s of CPU time, mostly for NumPy."""
     code = "import sys; from icrl4aht_data.commands.cli import cli; cli(['--help'], standalone_mode=False); "
     code += "print('loaded:', *sys.modules)"
     text, _, loaded = run_python("-c", code).partition("loaded: ")

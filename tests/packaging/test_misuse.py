@@ -1,4 +1,4 @@
-"""Test bad input on the command line: an exit code, one message with fault and remedy, and no traceback."""
+"""Test that bad input on the command line gives an exit code and one message with fault and remedy."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.
 train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
 train rl2 --layout demo_wide --size tiny | --size: cannot be used with rl2, which learns by playing
 train rl2 --layout demo_wide --next-obs --context 5 | --context, --next-obs: cannot be used with rl2, which learns
-train ad --layout demo_wide --epochs 2 | --epochs: cannot be used with ad, only with rl2, which plays
+train ad --layout demo_wide --epochs 2 | --epochs: cannot be used with ad, only with rl2, which learns by playing
 research reference --name rl2-reference --no-evaluate --bundle-as rl2-x | its card states its results
 research reference --name rl2-reference --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters
 results | Missing option '--out'
@@ -78,10 +78,10 @@ list none | none: no release here, expected meta/info.json in it; give the folde
 list empty | empty: no release here, expected meta/info.json in it; give the folder of a release
 verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
 list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
-convert {MINI} --out file/x --to lite | file: File exists; a file is where a folder is needed
+convert {MINI} --out file/x --to lite | file: File exists; expected a folder, found a file
 convert {MINI} --out none/index --to parquet | none/index: No such file or directory; check the path;
 combine --out out {MINI} --data-version banana | data version 'banana': expected a SemVer version such as 1.0.0
-research diversity --suite empty | empty: no layout has all its populations finished; `icrl4aht-data
+research diversity --suite empty | empty: no layout has all its populations finished; train
 train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
 train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
 collect --agent stay --layout coord_simple --source agent --out c | source = agent: none of Dataset(
@@ -95,7 +95,7 @@ evaluate --agent stay --out e --layout cramped_up | no task on cramped_up in
 
 
 def parse_cases(text: str, code: int) -> Iterator[tuple[str, str, int]]:
-    """Yield arguments, message and exit code of each line."""
+    """Yield the arguments, the expected message and the exit code of each line."""
     for line in text.strip().splitlines():
         arguments, _, message = line.partition(" | ")
         yield arguments.replace("{MINI}", str(MINI)), message, code

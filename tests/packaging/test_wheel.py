@@ -85,11 +85,11 @@ results = evaluate("mine", from_host(MyAgent()), tasks[:2], protocol, details={"
 print(len(results))
 print("matplotlib" in sys.modules or "PIL" in sys.modules)
 """
-"""Evaluates an agent of one's own, without drawing anything."""
+"""Code that evaluates a user's agent without drawing anything."""
 
 
 def run_isolated(*command: str | Path, **options) -> subprocess.CompletedProcess:
-    """Run a command without this environment's Python variables."""
+    """Run a command without the environment variables whose names start with PYTHON."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     environment |= options.pop("env", {})
     return subprocess.run(list(map(str, command)), capture_output=True, text=True, env=environment, **options)
@@ -176,7 +176,7 @@ def test_the_source_archive_is_complete(sdist):
 
 
 def find_python(version: str) -> str | None:
-    """Return the path of a working Python of this version, running or on the PATH; None if there is none."""
+    """Return the path of a working Python of the given version, the running one or one on the PATH, or None."""
     if sys.version.startswith(f"{version}."):
         return sys.executable
     found = shutil.which(f"python{version}")
@@ -192,7 +192,7 @@ def make_environment(python: str, folder: Path, *packages: str | Path) -> Path:
 
 
 def python_or_skip(version: str) -> str:
-    """Return the path of a Python of this version, or skip the test."""
+    """Return the path of a Python of the given version, or skip the test."""
     python = find_python(version)
     if python is None:
         absent = ", ".join(other for other in PYTHONS if find_python(other) is None)
@@ -234,7 +234,7 @@ def install_hint(*extras: str) -> str:
 
 
 def run_hint(hint: str, commands: Path) -> None:
-    """In an environment, run the install command at the end of a message."""
+    """Install the packages named by the install command at the end of a message."""
     found = re.search(r"pip install (.*)$", hint)
     assert found, hint
     install_packages(commands / "python", *shlex.split(found[1]))
@@ -275,7 +275,7 @@ def test_user_packages_with_equal_folder_names_do_not_break_commands(bare_enviro
 
 
 def test_extras_named_in_messages_allow_training_and_drawing(jax_environment, wheel, tmp_path):
-    """With only `jax`, models train and evaluate without drawing; the install command of the message adds drawing."""
+    """The extra `jax` is enough to train and evaluate models; the install command in messages adds drawing."""
     run = command_runner(jax_environment, tmp_path)
     run("python", "-c", "import jax, flax, optax, importlib.util as u; assert not u.find_spec('matplotlib')")
     assert run("python", "-c", EVALUATE).endswith("\nFalse\n")

@@ -18,7 +18,7 @@ PAGE = 4096
 
 
 class HungError(Exception):
-    """A block exceeded its time limit; not an OSError, which the tested code may handle."""
+    """Error of a block that exceeds its time limit; not an OSError, which tested code might catch."""
 
 
 @contextmanager

@@ -77,7 +77,7 @@ def cache_folder(tmp_path, monkeypatch) -> Path:
 
 
 class DamagedCopy:
-    """Small release that tests damage, with the data that reading returned before any damage."""
+    """Small release whose files tests damage, and the data read from it before any damage."""
 
     def __init__(self, root: Path) -> None:
         random_release(root, teammates=2, streams=1, episodes=6, length=15)
@@ -103,7 +103,7 @@ class DamagedCopy:
         finally:
             path.write_bytes(right)
 
-    def check(self, cache: CacheMode = "ram") -> None:
+    def check_damage(self, cache: CacheMode = "ram") -> None:
         """Assert that `verify` finds the damage, and that reading returns correct data or raises a package error."""
         assert not verify_release(self.root).ok, "verify finds nothing"
         with suppress(Icrl4ahtError):
@@ -125,7 +125,7 @@ def test_flipped_bit_never_changes_the_data_that_is_read(small_release, cache_fo
         data = bytearray(path.read_bytes())
         data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
         with small_release.damaged(path, bytes(data)):
-            small_release.check(modes[number % 3])
+            small_release.check_damage(modes[number % 3])
 
 
 VALUES = [0, -1, 2**31, 2**63, 10**400, 1e300, -0.5, None, True, "", "x", "\0", "../x", "/etc", "ü" * 9, [], [[]], {}]
@@ -163,7 +163,7 @@ def test_mutated_text_files_raise_only_package_errors(small_release, cache_folde
                     fetch_planned(plan_download(server.url, to=tmp_path / f"{number}"))
                     assert small_release.read(tmp_path / f"{number}") == small_release.before, "other data, downloaded"
                 continue
-            small_release.check()
+            small_release.check_damage()
             with small_release.damaged(small_release.root / MANIFEST, (small_release.root / MANIFEST).read_bytes()):
                 write_manifest(small_release.root)
                 verify_release(small_release.root)
@@ -220,7 +220,7 @@ CODE = {
 
 
 def start_process(code: str, *arguments: object) -> subprocess.Popen[str]:
-    """Start a Python process that runs `code` after a line on stdin; return when the process is ready."""
+    """Start a Python process that runs `code` once a line arrives on stdin; return when the process waits."""
     imports = """
 import sys
 from pathlib import Path
@@ -284,7 +284,7 @@ def test_changed_episode_length_in_info_raises_errors(small_release, tmp_path):
         load_icrl4aht(root)
     write_manifest(root)
     dataset = load_icrl4aht(root, layout="demo_wide")
-    with pytest.raises(OptionError, match="some history's episodes do not have 14 steps each; run"):
+    with pytest.raises(OptionError, match="expected episodes of 14 steps, found other episodes; run"):
         dataset.ad(batch_size=4, length=5, episodes=(1, 4))
 
 

@@ -26,7 +26,7 @@ from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.utils.files import atomic_write, parse_json, resolve_inside
 from tests.helpers.commands import run_cli
 from tests.robustness.hostile.cases import CASES, TERABYTE
-from tests.robustness.hostile.run import bound_process, make_bases, run_case
+from tests.robustness.hostile.run import bound_process, make_valid_inputs, run_case
 
 SECONDS = 400
 """Time for one case."""
@@ -38,7 +38,7 @@ DISK_BYTES = 64 * 2**20
 def run_hostile_case(tmp_path_factory) -> Iterator[Callable[[str], dict[str, Any]]]:
     """Yield a function that runs the case of a given name in a process with bounded memory."""
     folder = tmp_path_factory.mktemp("hostile")
-    make_bases(folder)
+    make_valid_inputs(folder)
     context = multiprocessing.get_context("spawn")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("OPENBLAS_NUM_THREADS", "1")
@@ -118,15 +118,15 @@ def test_names_are_printed_without_interpreting_markup(damaged):
 
 def test_parse_json_limits_the_depth_of_nesting():
     assert parse_json('{"a": [[1]]}') == {"a": [[1]]}
-    with pytest.raises(IndexFormatError, match="levels deep"):
+    with pytest.raises(IndexFormatError, match="found more levels"):
         parse_json("[" * 65 + "]" * 65)
 
 
 def test_file_names_reserved_by_microsoft_windows_are_refused(tmp_path):
     for name in ("con", "meta/NUL.json", "com1.h5/x", "a./b", "a /b", "data/teammate/aux/train.h5"):
-        with pytest.raises(Icrl4ahtError, match="leads out"):
+        with pytest.raises(Icrl4ahtError, match="points outside"):
             parse_manifest(f"{'0' * 64}  {name}\n", "MANIFEST")
-        with pytest.raises(Icrl4ahtError, match="leads out"):
+        with pytest.raises(Icrl4ahtError, match="points outside"):
             resolve_inside(tmp_path, name)
 
 
@@ -142,7 +142,7 @@ FOREIGN = (
 @pytest.mark.parametrize("name", FOREIGN)
 def test_unknown_file_names_in_a_manifest_are_refused(damaged, name):
     line = f"{'0' * 64}  {name}\n"
-    with pytest.raises(UnsafePathError, match=r"not a file that a release may contain|leads out"):
+    with pytest.raises(UnsafePathError, match=r"not a file that a release may contain|points outside"):
         parse_manifest(line, "MANIFEST")
     with (damaged / MANIFEST).open("a") as stream:
         stream.write(line)

@@ -90,7 +90,7 @@ Rule = Callable[[Request], Fault | None]
 class Faults:
     """A list of rules: the first rule that returns a fault decides the fault of a request. Thread safe.
 
-    The path of a rule is a pattern of fnmatch (`*` also matches `/`); None as its method matches any method.
+    The path of a rule is a pattern of fnmatch (`*` also matches `/`); The method None matches any method.
     """
 
     def __init__(self) -> None:
@@ -102,7 +102,7 @@ class Faults:
             return next((fault for rule in self._rules if (fault := rule(request)) is not None), None)
 
     def add(self, rule: Rule) -> None:
-        """Add a function that returns a request's fault or None; it is called under a lock, so it may count."""
+        """Add a function that returns a request's fault or None; a lock guards its calls, so it may count requests."""
         with self._lock:
             self._rules.append(rule)
 

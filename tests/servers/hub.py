@@ -13,7 +13,7 @@ from urllib.parse import unquote, urlsplit
 from tests.servers.faults import Faults, Request
 from tests.servers.http import Answer, Server
 from tests.servers.hub_repos import HubState, Refusal, Repo, is_large
-from tests.servers.hub_routes import ROUTES, Call
+from tests.servers.hub_routes import ROUTES, HubRequest
 from tests.servers.process import hub_environment, hub_settings
 
 
@@ -70,7 +70,7 @@ class Hub(HubState):
                 names = {name: unquote(text) for name, text in found.groupdict().items()}
                 try:
                     with self._lock:
-                        return route(Call(self, request, names, body))
+                        return route(HubRequest(self, request, names, body))
                 except Refusal as refusal:
                     return refusal.answer
         return Refusal(404, "Sorry, we can't find the page you are looking for.").answer
@@ -91,7 +91,7 @@ class Hub(HubState):
 
 @contextmanager
 def hub_server(root: Path) -> Iterator[Hub]:
-    """Run an empty test Hub, which all of huggingface_hub in this process uses meanwhile.
+    """Run an empty test Hub, and direct huggingface_hub in this process to this Hub within the context.
 
     Args:
         root: empty folder for contents and for the client's caches.

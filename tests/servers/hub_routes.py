@@ -20,8 +20,8 @@ WEB = r"/datasets/(?P<id>[^/]+/[^/]+)"
 
 
 @dataclass(frozen=True)
-class Call:
-    """A request to the test Hub: the Hub's state, the request, the parts of its path by name, and its body."""
+class HubRequest:
+    """A request to the test Hub, with the state of the Hub, the named parts of the path, and the body."""
 
     hub: HubState
     request: Request
@@ -53,14 +53,14 @@ class Call:
             raise Refusal(401, "Invalid username or password.")
 
 
-Route = Callable[[Call], Answer]
+Route = Callable[[HubRequest], Answer]
 
 
 def answer(data: Any, status: int = 200, **headers: str) -> Answer:
     return Answer(json.dumps(data).encode(), status, {"Content-Type": "application/json", **headers})
 
 
-def info(call: Call) -> Answer:
+def info(call: HubRequest) -> Answer:
     repo = call.repo
     commit = repo.resolve(call.names.get("revision", "main"))
     data = {"_id": "0" * 24, "id": repo.id, "author": repo.id.split("/")[0], "sha": commit.oid, "gated": False}
@@ -69,7 +69,7 @@ def info(call: Call) -> Answer:
     return answer(data | {"tags": [], "siblings": siblings})
 
 
-def tree(call: Call) -> Answer:
+def tree(call: HubRequest) -> Answer:
     """Answer with all files and folders below a folder, at all depths; the default is the root folder."""
     folder = f"{call.names['path']}/".lstrip("/")
     files = call.repo.resolve(call.names["revision"]).files
@@ -81,7 +81,7 @@ def tree(call: Call) -> Answer:
     return answer([*below, *found.values()])
 
 
-def refs(call: Call) -> Answer:
+def refs(call: HubRequest) -> Answer:
     def listed(folder: str, names: dict[str, str]) -> list[dict]:
         return [{"name": name, "ref": f"refs/{folder}/{name}", "targetCommit": oid} for name, oid in names.items()]
 
@@ -90,7 +90,7 @@ def refs(call: Call) -> Answer:
     return answer(data | {"pullRequests": []})
 
 
-def resolve(call: Call) -> Answer:
+def resolve(call: HubRequest) -> Answer:
     """Answer with the content of a file, or with a redirect to the CDN if the file is stored by LFS."""
     commit, path = call.repo.resolve(call.names["revision"]), call.names["path"]
     headers = {"X-Repo-Commit": commit.oid}
@@ -108,7 +108,7 @@ def resolve(call: Call) -> Answer:
     return Answer(b"Found. Redirecting\n", 302, headers)
 
 
-def create(call: Call) -> Answer:
+def create(call: HubRequest) -> Answer:
     call.require_token()
     wanted = call.json()
     id = f"{wanted['organization']}/{wanted['name']}"
@@ -122,7 +122,7 @@ def create(call: Call) -> Answer:
     return answer({"url": url, "name": id, "id": repo.id})
 
 
-def preupload(call: Call) -> Answer:
+def preupload(call: HubRequest) -> Answer:
     """Answer for each announced file whether to upload it by LFS, and with the hash of the existing file."""
     call.require_token()
     commit, listed = call.repo.resolve(call.names["revision"]), []
@@ -137,7 +137,7 @@ def preupload(call: Call) -> Answer:
     return answer({"files": listed, "commitOid": commit.oid})
 
 
-def lfs_batch(call: Call) -> Answer:
+def lfs_batch(call: HubRequest) -> Answer:
     """Answer with upload addresses for those large files whose content the CDN does not have."""
     call.require_token()
     objects = []
@@ -149,7 +149,7 @@ def lfs_batch(call: Call) -> Answer:
     return answer({"transfer": "basic", "objects": objects})
 
 
-def commit(call: Call) -> Answer:
+def commit(call: HubRequest) -> Answer:
     call.require_token()
     repo, branch = call.repo, call.names["revision"]
     head = repo.resolve(branch)
@@ -181,7 +181,7 @@ def _apply(hub: HubState, files: dict[str, File], key: str, value: dict) -> None
         raise Refusal(404, f"{key}: a file with this name doesn't exist: {path}", "EntryNotFound")
 
 
-def new_tag(call: Call) -> Answer:
+def new_tag(call: HubRequest) -> Answer:
     call.require_token()
     repo, name = call.repo, call.json()["tag"]
     if name in repo.tags:
@@ -190,7 +190,7 @@ def new_tag(call: Call) -> Answer:
     return answer({})
 
 
-def validate_yaml(call: Call) -> Answer:
+def validate_yaml(call: HubRequest) -> Answer:
     """Answer as the Hub does to a valid dataset card, without checking the card."""
     return answer({"errors": [], "warnings": []})
 

@@ -22,7 +22,7 @@ uploads = pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning")
 
 @contextmanager
 def environment(changes: Mapping[str, str | None]) -> Iterator[None]:
-    """Set environment variables for a while; the value None removes a variable."""
+    """Set environment variables within a context; the value None removes a variable."""
     before = {name: os.environ.get(name) for name in changes}
     try:
         _set(changes)

@@ -110,14 +110,14 @@ def bundle_run(
     trained, config = read_trained(run), read_config(run)
     steps = config["train"]["steps"]
     if trained.step < steps:
-        raise OptionError(f"{run}: at step {trained.step} of {steps}: continue the training with the same command")
+        raise OptionError(f"{run}: stopped at step {trained.step} of {steps}; resume training with the same command")
     size = sum(4 * leaf.size for leaf in jax.tree.leaves(trained.params))
     if size > _LARGEST:
         raise OptionError(f"{run}: parameters of {size:,} bytes, expected at most {_LARGEST:,}: bundle a smaller model")
     target = folder / name / track
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
-    if not is_address(config["histories"]["root"]):  # a path on the training machine means nothing on others
+    if not is_address(config["histories"]["root"]):  # a path on the training machine means nothing on other machines
         config["histories"]["root"] = Path(config["histories"]["root"]).name
     (target / CONFIG).write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
     Checkpoints(target / CHECKPOINTS).save({"params": trained.params}, trained.step)

@@ -178,8 +178,8 @@ def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Lay
         if run.channels == "own" and layout.obs_shape != run.obs_shape:
             raise OptionError(
                 f"{folder}: trained on {', '.join(run.layouts)} with observations {run.obs_shape}; "
-                f"{layout.name} has {layout.obs_shape}: choose tasks of fitting layouts, or train with --channels "
-                f"canonical, which all layouts share"
+                f"{layout.name} has {layout.obs_shape}; choose tasks on layouts with the same observation "
+                f"shape, or train with --channels canonical"
             )
         return with_view(policy, run.channels, layout.name in run.hide_recipe)
 
@@ -215,7 +215,7 @@ def trained_policy(method: Method, params: Any, context: int, mode: PlayMode = A
 def with_view(policy: Policy, channels: Channels, hide_recipe: bool = False) -> Policy:
     """Return a policy that receives observations with the given channels.
 
-    Two policies that share their functions still share them in the results, and so one compiled program.
+    If two policies share their functions, the returned policies do too, so they share one compiled program.
 
     Args:
         policy: policy for observations with these channels.

@@ -38,7 +38,7 @@ class EgoInput(NamedTuple):
 
 
 class HostPolicy(Policy):
-    """A policy with functions of B tasks, that is of B keys and B `EgoInput`s, for agents that JAX cannot batch."""
+    """A policy whose functions take the keys and `EgoInput`s of B tasks, for agents that JAX cannot batch."""
 
 
 class HostAgent(Protocol):
@@ -59,7 +59,7 @@ class HostAgent(Protocol):
 def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout], HostPolicy]:
     """Return the `make_ego` argument of `icrl4aht_baselines.evaluate.evaluate` for a `HostAgent`.
 
-    For each layout and teammate family, `reset` is called once and then `act` once per step, with all of its tasks.
+    For each layout and teammate family, `reset` is called once, then `act` once per step for all tasks.
 
     Args:
         agent: the ego.

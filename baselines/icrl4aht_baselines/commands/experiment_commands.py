@@ -25,22 +25,22 @@ from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.proof import PROOF_FILE, proof_table
 
-_STEPS = 8_000_000  # environment steps of the training of an informed or episodic ego
+_STEPS = 8_000_000  # environment steps to train an informed or episodic ego
 
 
 def _job_options(out: str, card: str) -> tuple[Callable[[Any], Any], ...]:
-    """Return the options of a command that runs a queue of trainings."""
+    """Return the options of a command that runs a queue of training jobs."""
     return (
         topic("Machines", queue_options),
-        click.option("--out", type=Folder(), metavar="FOLDER", default=out, help="Write trainings here."),
+        click.option("--out", type=Folder(), metavar="FOLDER", default=out, help="Write training runs here."),
         click.option("--bundle", is_flag=True, help=f"Also update {card} of the package's cards."),
     )
 
 
 def _ego_options(out: str, card: str, *own: Callable[[Any], Any], **default_text: str) -> Callable[[Any], Any]:
-    """Return a decorator that adds the options of a command that trains egos; `own` are further training options."""
+    """Return a decorator that adds the options of a command that trains egos, including its `own` training options."""
     training = dataclass_options(ResponseOptions, "training", exclude=("learning_rate",), default_text=default_text)
-    seeds = click.option("--seeds", type=COUNT, default=3, help="Trainings of each ego, with different seeds.")
+    seeds = click.option("--seeds", type=COUNT, default=3, help="Training runs of each ego, with different seeds.")
     topics = topic("Tasks", *shared.tasks_options), topic("Training", *own, seeds, training)
     return shared.add_options(*topics, *_job_options(out, card))
 
@@ -50,7 +50,7 @@ def _prepare_queue(queue: dict[str, Any]) -> QueueOptions:
     options = read_queue_options(queue)
     from icrl4aht_generation.learners.resume import limit_xla_threads
 
-    limit_xla_threads(1)  # as in workers, so that a job may resume in either
+    limit_xla_threads(1)  # equal to the workers' limit, so that workers can resume these jobs
     return options
 
 
@@ -67,7 +67,7 @@ def _run_queue(
     Args:
         jobs: the jobs to run.
         options: settings of the job queue.
-        out: folder of the trainings.
+        out: folder of the training runs.
         bundle: whether to write the results into the package's cards as well.
         write: function that writes the results into a folder, and returns the path of the file.
         table: function that returns the table of the results in a folder.
@@ -188,9 +188,9 @@ def best_response_command(
 
     An ego with the benchmark's view is trained with a single teammate, by PPO that imitates the oracle in the first
     half of the steps. Teammates that behave the same share one best response. Tasks in which the oracle earns no more
-    than `stay` are left out. The best training is chosen on other episodes than the reported ones. A stored model that
-    earns more replaces the trained best response. Writes OUT/best_responses.json and prints a table. Finished
-    trainings are reused and stopped ones resume. Give more --steps if the return still rises in the last quarter.
+    than `stay` are left out. The best training run is chosen on other episodes than the reported ones. A stored model
+    that earns more replaces the trained best response. Writes OUT/best_responses.json and prints a table. Finished
+    runs are reused, and stopped runs resume. Give more --steps if the return still rises in the last quarter.
     """
     options = _prepare_queue(queue)
     from icrl4aht_baselines.online.responses import (
@@ -243,7 +243,7 @@ def adaptation_headroom_command(
     Trains two egos on the tasks of each layout. An informed ego observes the task's number in every step; an episodic
     ego has to find out the teammate in each episode. Prints the difference of their returns, with an interval over the
     seeds. The difference is an estimate, because both egos are trained for --steps only. Writes OUT/adaptation.json.
-    Finished trainings are reused and stopped ones resume.
+    Finished training runs are reused, and stopped runs resume.
     """
     options = _prepare_queue(queue)
     from icrl4aht_baselines.online.adaptation import adaptation_table, headroom_jobs, write_adaptation
@@ -292,8 +292,8 @@ def proof_command(
 
     Trains small AD and DPT models on the release only, and evaluates them on validation tasks. On the track preference
     each model also plays with its memory cleared before each episode. On the track teammate the models are compared
-    with rl2-reference. A training takes about 35 minutes on one core. Writes OUT/proof.json, which the release's card
-    shows. Finished trainings are reused and stopped ones resume.
+    with rl2-reference. Training a model takes about 35 minutes on one core. Writes OUT/proof.json, which the release's
+    card shows. Finished runs are reused, and stopped runs resume.
     """
     options = _prepare_queue(queue)
     from icrl4aht_baselines.proof import LEARNERS, ProofJob, ProofOptions, run_references, write_proof

@@ -142,10 +142,10 @@ def collect_command(
 def reference_command(
     names: tuple[str, ...], track: tuple[str, ...], teacher: str | None, evaluates: bool, bundle: str | None, out: Path
 ) -> None:
-    """Make reference models, with everything that they need.
+    """Make reference models, and the data that they are trained on.
 
-    Generates a release of noise histories, trains one model for each track, and evaluates it. Models that learn from
-    histories of a trained agent get these recorded first. The same command resumes a stopped run. rl2-reference learns
+    Generates a release of noise histories, trains one model for each track, and evaluates it. Histories of a trained
+    agent, if a model learns from them, are recorded first. The same command resumes a stopped run. rl2-reference learns
     by playing with training teammates. ad-reference and dpt-reference learn from histories of rl2-reference, labelled
     with its choices. ad-rising imitates histories of rl2-reference whose actions are random at first.
     """
@@ -159,9 +159,9 @@ def reference_command(
             raise click.UsageError(f"--bundle-as: {error}") from error
         if len(names) != 1 or {*track} != set(TRACKS) or not evaluates:
             raise click.UsageError(
-                "--bundle-as: expected one --name of all tracks, evaluated: its card states its results"
+                "--bundle-as: expected one --name, all tracks and an evaluation, since the card states the results"
             )
-    if teacher:  # raises before hours of work
+    if teacher:  # an invalid name is an error before hours of work
         find_ego("--teacher", teacher)
         for name in names:
             check_learns_from_teacher(name)
@@ -221,9 +221,9 @@ def submit_command(
 
     Each FOLDER was written by `evaluate`, under the protocol seeded with seeds 0, 1 and 2. Together the folders must
     hold all test tasks of a track, or of both tracks, and state what the agent was trained on. Several folders hold the
-    agent's tracks, or its trainings with different seeds. Results of `evaluate --controls` are included. Results with
-    a model's other way of choosing actions, such as `evaluate --sampled`, are shown in separate rows. A pull request
-    that adds the file puts the agent on the page; `icrl4aht-data results FILE` shows a preview.
+    agent's tracks, or its training runs with different seeds. Results of `evaluate --controls` are included. Results
+    with a model's other way of choosing actions, such as `evaluate --sampled`, are shown in separate rows. A pull
+    request that adds the file puts the agent on the page; `icrl4aht-data results FILE` shows a preview.
     """
     from icrl4aht_baselines.report import comparison, submission
 

@@ -40,12 +40,12 @@ def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
 
 
 def find_ego(option: str, value: str, **mode: Any) -> Any:
-    """Return the ego that is named by an option's value, as a `icrl4aht_baselines.agents.egos.NamedEgo`.
+    """Return the ego that an option's value names, as an `icrl4aht_baselines.agents.egos.NamedEgo`.
 
     Args:
         option: name of the option, for messages.
         value: name or run folder of the ego.
-        mode: further arguments of `icrl4aht_baselines.agents.egos.find_agent`.
+        mode: keyword arguments for `icrl4aht_baselines.agents.egos.find_agent`.
 
     Raises:
         click.UsageError: if the value is neither a reference ego, nor a bundled model, nor a run folder.
@@ -141,7 +141,7 @@ def chosen_tasks(
     if not chosen:
         found = manifest or f"the tasks of split {' and '.join(split)}"
         wanted = "".join(f" {word} {', '.join(sorted(of))}" for word, of in (("on", names), ("with", families)) if of)
-        raise EmptySelectionError(f"no task{wanted} in {found}: choose another --layout or --family, or none")
+        raise EmptySelectionError(f"no task{wanted} in {found}: choose another --layout or --family, or leave them out")
     return chosen
 
 
@@ -195,7 +195,7 @@ def prepare_training(
     histories: HistoryOptions,
     manifests: Sequence[Path] = (),
 ) -> tuple[Any, str]:
-    """Return a training as a `icrl4aht_baselines.training.trainer.TrainingTask`, and a text that describes it.
+    """Return a training run as an `icrl4aht_baselines.training.trainer.TrainingTask`, and its description as text.
 
     Args:
         method: name of the method.
@@ -231,7 +231,7 @@ def prepare_training(
         )
         return job, text
     if given := {*play, *(["manifest"] if manifests else [])}:
-        raise click.UsageError(f"{_flags(given)}: cannot be used with {method}, only with rl2, which plays")
+        raise click.UsageError(f"{_flags(given)}: cannot be used with {method}, only with rl2, which learns by playing")
     on_cpu = jax.default_backend() == "cpu"
     name = size or ("tiny" if on_cpu else "small")
     sized = ModelOptions(**SIZES[name].model | model)
@@ -267,11 +267,11 @@ process_options = topic(
     click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes."),
     click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process."),
 )
-"""Options of a training on several machines; `join_processes` takes their values."""
+"""Options for training on several machines; `join_processes` takes their values."""
 
 
 def join_processes(coordinator: str | None, processes: int, process: int) -> None:
-    """Connect this process to the other processes of a training, if a coordinator is given.
+    """Connect this process to the other processes of a training run, if a coordinator is given.
 
     Raises:
         click.UsageError: if the options contradict each other.
@@ -282,7 +282,7 @@ def join_processes(coordinator: str | None, processes: int, process: int) -> Non
         raise click.UsageError(f"--coordinator {coordinator}: expected HOST:PORT, such as 10.0.0.1:6000")
     if not coordinator and (processes, process) != (1, 0):
         raise click.UsageError(
-            "--processes and --process: expected a --coordinator HOST:PORT as well, the same for all"
+            "--processes and --process: expected --coordinator HOST:PORT as well, equal in all processes"
         )
     if process >= processes:
         raise click.UsageError(f"--process {process}: expected a number below {processes}")

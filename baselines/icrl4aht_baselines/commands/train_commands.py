@@ -92,7 +92,7 @@ def evaluate_command(
     from icrl4aht_baselines.report.scores import control_lines
 
     if forget and controls:
-        raise click.UsageError("--controls: cannot be used with --forget, which is one of them; leave out one")
+        raise click.UsageError("--controls: cannot be used with --forget, which is a control; leave out one of the two")
     ego = find_ego("--agent", agent, acting=acting, greedy=greedy)
     chosen = limit_tasks(shared.chosen_tasks(**choice), tasks)
     if chosen_seeds:

@@ -39,8 +39,8 @@ class ControlSize:
         rows: number of training histories of AD, and of training tasks of DPT.
         tasks: number of tasks in the evaluation.
         updates: training steps of DPT on bandits, AD on bandits, and AD in Dark Room.
-        learning_rates: learning rates of the same three trainings.
-        batch_size: batch size of all three trainings.
+        learning_rates: learning rates of the same three training runs.
+        batch_size: batch size of all three training runs.
     """
 
     bandit_steps: int = 100
@@ -78,7 +78,7 @@ class ControlCheck(NamedTuple):
 
 
 ControlProgress = Callable[[str, int, int, float | None], None]
-"""Called with (name of a training, its number of updates, updates so far, last logged loss or None)."""
+"""Called with (name of a training run, its number of updates, updates so far, last logged loss or None)."""
 
 
 def run_control(

@@ -40,7 +40,7 @@ class FlatEncoder(nn.Module):
 
 
 class SmallWorld(NamedTuple):
-    """Rules of a small environment, as pure functions. A task is an array, a state an integer.
+    """Rules of a small environment, as pure functions. A task is an array, and a state is an integer.
 
     Attributes:
         world: description of the environment for models.
@@ -90,7 +90,7 @@ NEXT_CELLS = (_TO[..., 0] * SIDE + _TO[..., 1]).astype(np.int32)
 
 
 def dark_room() -> SmallWorld:
-    """Return Dark Room: a task is the number of the goal's grid cell, int32 (); a step that ends on it earns 1."""
+    """Return Dark Room: a task is the number of the goal's grid cell, int32 (); a step that ends there earns 1."""
     next_cells = jnp.asarray(NEXT_CELLS)
 
     def step(goal: Array, cell: Array, action: Array, key: Array) -> tuple[Array, Array]:
@@ -102,7 +102,7 @@ def dark_room() -> SmallWorld:
 
 
 def best_return(goal: np.ndarray) -> np.ndarray:
-    """Return the highest possible return of a Dark Room episode: an agent walks straight to the goal, float (N,)."""
+    """Return the highest possible returns in Dark Room, of an agent that walks straight to the goal, float (N,)."""
     return ROOM_STEPS + 1.0 - np.maximum(_distance(goal, np.asarray(MIDDLE)), 1)
 
 
@@ -178,7 +178,7 @@ def play_bandits(
 
 
 def search(goals: np.ndarray, episodes: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Dark Room histories of a learner that searches the goal: positions, actions (int32), rewards (float32).
+    """Return Dark Room histories of a learner that finds the goal: positions, actions (int32), rewards (float32).
 
     The arrays have shape (N, T). The learner walks between random grid cells until it is rewarded, and from then on
     straight to the cell of that reward. Half of its moves are random at first. The share of random moves falls linearly

@@ -319,8 +319,8 @@ def play_tasks(
     """
     if len(segment_lengths(protocol)) > 1:
         raise OptionError(
-            f"protocol {protocol.name}: the teammate changes every {protocol.swap_every} episodes; expected no more "
-            f"episodes here, found {protocol.episodes}"
+            f"protocol {protocol.name}: expected at most {protocol.swap_every} episodes, after which the teammate "
+            f"changes, found {protocol.episodes}; use `evaluate`"
         )
     yield from play_episodes(prepare_rollout(make_ego, tasks, protocol, seeds, suite), forget=forget)
 
@@ -358,7 +358,7 @@ def play_episodes(
 
 
 class ControlledResults(NamedTuple):
-    """Results of an ego and of its controls on U tasks with S seeds; equal episodes have equal random keys.
+    """Results of an ego and of its controls on U tasks with S seeds, all with the same random keys.
 
     Attributes:
         plain: results of the ego without a control.
@@ -409,7 +409,7 @@ def evaluate_controls(
             a task has no partner.
     """
     rules = protocol if isinstance(protocol, Protocol) else get_protocol(protocol)
-    plan_tasks(tasks, rules, "swapped")  # raises before hours of work
+    plan_tasks(tasks, rules, "swapped")  # a task without a partner is an error before hours of work
     # Only equal functions share compiled programs, and some `make_ego` return new functions in each call.
     make = make_ego if make_ego in SCRIPTED else cache(make_ego)
     options["programs"] = Programs() if programs is None else programs

@@ -82,7 +82,7 @@ def test_tasks(track: str, layout: str | None = None, family: str | None = None)
     if not found:
         layouts, families = ({getattr(task, of) for task in every} for of in ("layout_name", "teammate_family"))
         raise EmptySelectionError(
-            f"layout = {layout}, family = {family}: no test task of track {track}; it has layouts "
+            f"layout = {layout}, family = {family}: no test task of track {track}, which has layouts "
             f"{', '.join(sorted(layouts))} and families {', '.join(sorted(families))}"
         )
     return found
@@ -130,7 +130,7 @@ def get_protocol(name: str, episodes: int | None = None) -> Protocol:
 
 
 def hidden_recipe_note(tasks: Sequence[Task]) -> str:
-    """Return a sentence that names the layouts whose observations do not show the ordered dish; empty without any.
+    """Return a sentence that names the layouts whose observations do not show the ordered dish, or an empty string.
 
     Layouts with a single recipe are not named, unless their tasks have a fixed dish, which is one of several.
     """

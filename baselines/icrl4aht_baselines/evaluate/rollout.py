@@ -104,7 +104,7 @@ class EvaluationRollout:
     def move_to_layouts(self, state: RolloutState) -> RolloutState:
         """Return another rollout's state between two episodes, moved to the layouts of this rollout.
 
-        Both rollouts are of the same tasks. Random keys, the number of the episode and the egos' memories are kept.
+        Both rollouts play the same tasks. Random keys, the number of the episode and the egos' memories are kept.
         """
         numbers = self._layout_numbers()
         record = self.env.first_record(state.env.key, state.env.episode, numbers)
@@ -215,7 +215,7 @@ class Programs:
         policies = [(policy.init, policy.act, policy.sees) for policy in (rollout.ego, rollout.teammates[0])]
         layouts = rollout.layout if isinstance(rollout.layout, Layout) else tuple(rollout.layout)
         shapes = tuple((np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves)
-        rules = rollout.protocol.steps, rollout.protocol.four_recipes  # further rules are part of states and policies
+        rules = rollout.protocol.steps, rollout.protocol.four_recipes  # all other rules are in states and policies
         key = layouts, rules, *policies, structure, shapes
         mine = Future[EpisodeProgram]()
         with self._lock:

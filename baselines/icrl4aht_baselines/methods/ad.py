@@ -131,7 +131,7 @@ def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head:
 
 
 def step_method(name: str, label: str, model: StepModel, loss: Loss, world: World, **settings: Any) -> Method:
-    """Return a method that is trained on AD batches; `settings` are further fields of `Method`."""
+    """Return a method that is trained on AD batches, with the given `settings` as further fields of `Method`."""
     example = example_step(world)
     return Method(
         name=name, label=label, data="ad", model=model, example=(example, example.prev_action), loss=loss, **settings
@@ -163,7 +163,7 @@ def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
     def loss(params: Any, slow: Any, batch: ADBatch, key: Any) -> tuple[Array, dict[str, Array]]:
         steps, mask = batch_steps(batch, world.view), jnp.asarray(batch.attention_mask)
         targets = jnp.asarray(batch.target_actions)
-        # The next step states the action of a step; the last step has no next one, and is not used by the loss.
+        # A step's action is an input of the next step. The last step has no next step, so the loss ignores it.
         taken = jnp.roll(steps.prev_action, -1, axis=1)
         output: StepOutput = run_model(model, options, params, key, steps, taken)
         errors = cross_entropy(output.head, targets, options.label_smoothing)

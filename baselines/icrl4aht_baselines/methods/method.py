@@ -91,7 +91,7 @@ class Method:
         return self.model.apply({}, context, cached, method="start")
 
     def act(self, params: Any, step: StepInput, done: Bool[Array, ""], memory: Any) -> tuple[Float[Array, " A"], Any]:
-        """Return policy logits, float32, and the new memory; `done`: whether the previous step ended an episode."""
+        """Return policy logits, float32, and the new memory; `done` is whether the previous step ended an episode."""
         output, memory = self.model.apply({"params": params}, step, done, memory, method="act")  # type: ignore[misc]
         return self.logits(output).astype(jnp.float32), memory
 
@@ -107,7 +107,7 @@ def make_transformer(options: ModelOptions) -> Transformer:
 
 
 def make_tokens(kind: type[TokensType], options: ModelOptions, world: World, **own: Any) -> TokensType:
-    """Return a tokenizer of the class `kind`; `own` are further arguments of this class."""
+    """Return a tokenizer of the class `kind`, with the arguments `own` that only this class has."""
     dtype = compute_dtype(options)
     return kind(
         encoder=world.encoder(dtype),

@@ -1,4 +1,4 @@
-"""Hyper-parameters of the models; imports no JAX, so that the help of commands is printed quickly."""
+"""Hyper-parameters of the models; imports no JAX, so that help texts are printed quickly."""
 
 from __future__ import annotations
 
@@ -116,4 +116,4 @@ UNUSED_BY_RL2 = {
     *("layers", "heads", "positions", "remat", "discounts", "dropout", "next_obs", "label_smoothing", "bfloat16"),
     *("context", "accumulate", "weight_decay", "validate_every", "validation_batches"),
 }
-"""Names of the options of models and trainings that RL^2 does not use."""
+"""Names of the options of models and training that RL^2 does not use."""

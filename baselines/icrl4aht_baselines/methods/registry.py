@@ -53,7 +53,7 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
     def make_checked(options: ModelOptions, world: World) -> Method:
         method = make(options, world)
         if not isinstance(method, Method):
-            raise METHOD_PLUGINS.error(name, f"expected a function that returns a Method, it returned {method!r:.100}")
+            raise METHOD_PLUGINS.error(name, f"expected a function that returns a Method, found result {method!r:.100}")
         if method.name != name or method.data not in ("ad", "dpt"):
             raise METHOD_PLUGINS.error(
                 name,

@@ -21,7 +21,7 @@ class AttentionCache(NamedTuple):
     """Keys and values of earlier tokens in one layer, one slot per token.
 
     Attributes:
-        keys: float32 (H, S, Dh); the slots of a head are contiguous, because products per head are fastest so.
+        keys: float32 (H, S, Dh); the slots of a head are contiguous, which makes products per head fastest.
         values: float32 (H, S, Dh).
     """
 
@@ -175,7 +175,7 @@ class Transformer(nn.Module):
     def start_after(self, x_NxD: Float[Array, "N D"], context: int) -> TransformerMemory:
         """Return a memory with `context` slots that stores a sequence of tokens."""
         length, caches = len(x_NxD), []
-        if not length:  # DPT with context = 0
+        if not length:  # the context of DPT may be empty
             return self.start(context)
         for block in self.blocks:
             x_NxD, cache = block.cache(x_NxD, jnp.arange(length))

@@ -51,7 +51,7 @@ class ViewChange(NamedTuple):
     sideways: Bool[Array, "*B"]
 
     def observations(self, obs: Num[Array, "*B 5 5 46"]) -> Num[Array, "*B 5 5 46"]:
-        """Return the changed observations, which the ego sees, for those of the environment."""
+        """Convert the environment's observations to the changed observations that the ego sees."""
         hidden, rows, columns = (flag[..., None, None, None] for flag in self)
         # `.at[..., _WALL].max` would be a scatter, which is several times slower than the rest of this function.
         walls = jnp.maximum(obs, obs[..., _INDICATOR, None])
@@ -70,7 +70,7 @@ class ViewChange(NamedTuple):
 
 
 def _exchange_directions(obs: Array, one: str, other: str) -> Array:
-    """Return observations with two directions, in which agents face, exchanged.
+    """Return observations in which two directions that agents may face are exchanged.
 
     The channels are copied in slices, which is much faster than a gather of all channels.
     """

@@ -3,7 +3,7 @@
 Two recurrent egos are trained on the same tasks with the same budget, and both have their memory cleared before each
 episode. The *informed* ego observes the task's number in every step; the *episodic* ego has to find out within the
 episode which teammate it plays with. The informed ego's return minus the episodic ego's return estimates how much
-memory across episodes can earn. It is an estimate, because a longer training would raise both returns.
+memory across episodes can earn. It is an estimate, because longer training would raise both returns.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class HeadroomJob(TrainingJob):
         return {"returns": {task.task_id: round(float(np.mean(by_task[k])), 3) for k, task in enumerate(self.tasks)}}
 
     def _task_groups(self) -> tuple[list[TaskGroup], dict[str, list[int]]]:
-        """Return the groups of tasks that are played in parallel, and name of a group -> numbers of its tasks."""
+        """Return the groups of tasks that are played in parallel, and group name -> numbers of the group's tasks."""
         numbers: dict[str, list[int]] = defaultdict(list)
         for played in range(self.options.tasks):
             number = played % len(self.tasks)
@@ -122,9 +122,9 @@ def headroom_jobs(
 
 
 def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | None:
-    """Return the entry of a set of tasks for cards/adaptation.json; None if no seed has both egos trained.
+    """Return the entry of a set of tasks for cards/adaptation.json; None if no seed has finished jobs of both egos.
 
-    An entry has the steps and the network's width of the trainings, the mean return of each kind of ego for each seed,
+    An entry has the training steps, the width of the network, the mean return of each kind of ego for each seed,
     and the mean return on each layout over these seeds.
     """
     own = [job for job in jobs if job.title == title and job.is_finished()]
@@ -149,7 +149,7 @@ def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | 
 
 
 ADAPTATION = "adaptation.json"
-"""Name of the file of measured returns, in a folder of trainings and among the package's cards."""
+"""Name of the file of measured returns, in a folder of training runs and among the package's cards."""
 
 
 def write_adaptation(jobs: Sequence[HeadroomJob], folder: Path) -> Path:

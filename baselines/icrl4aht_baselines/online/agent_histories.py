@@ -94,7 +94,7 @@ def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> P
     """
     if labeller is not None and labeller.sees != policy.sees:
         raise OptionError(
-            f"the labeller takes {labeller.sees}, expected {policy.sees}, as the agent does: choose a trained model"
+            f"the labeller takes {labeller.sees}, expected {policy.sees}, which the agent takes; choose a trained model"
         )
     params = policy.params, None if labeller is None else labeller.params
 
@@ -386,7 +386,7 @@ def _agent_task(
     teammates: Teammates,
     swaps: TeammateSwaps | None,
 ) -> NewTask:
-    """Return a task with its histories from a group's folder, which are read only when the release is written."""
+    """Return a task whose histories are read from a group's folder when the release is written."""
     rows = slice(number * config.histories, (number + 1) * config.histories)
     rewards = np.load(folder / "rewards.npy", mmap_mode="r")[rows]
     returns = rewards.reshape(config.histories, config.episodes, -1).sum(axis=-1, dtype=np.float64)

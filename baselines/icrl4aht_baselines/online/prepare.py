@@ -1,4 +1,4 @@
-"""Preparation of an RL^2 training with the teammates of a release and of other tasks."""
+"""Preparation of RL^2 training with the teammates of a release and of other tasks."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def prepare_play(
     histories: HistoryOptions,
     tasks: Sequence[Task] = (),
 ) -> TrainingTask:
-    """Return the training of a method that plays with the teammates of a release's histories and of other tasks.
+    """Return the training task of a method that plays with the teammates of a release's histories and of other tasks.
 
     Args:
         name: name of the method.
@@ -115,7 +115,7 @@ def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple
     if ALL_LAYOUTS not in histories.layouts:
         layouts = list(dict.fromkeys(get_layout(one) for one in histories.layouts))
         stored = {get_layout(layout.name) for layout in release.layouts}
-        # `release.filter` refuses layouts without histories; with `tasks` such layouts are left to these.
+        # `release.filter` refuses layouts without histories, but `tasks` may be on such layouts.
         names = [layout.name for layout in layouts if not tasks or layout in stored]
         if not names:
             return release, None, layouts
@@ -130,7 +130,7 @@ def _tasks_on_layouts(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[
     found = [task for task in tasks if task.layout.name in names]
     if tasks and not found:
         on = ", ".join(sorted({task.layout.name for task in tasks}))
-        raise OptionError(f"none of the {len(tasks)} tasks is on {', '.join(one.name for one in layouts)}, but on {on}")
+        raise OptionError(f"expected tasks on {', '.join(one.name for one in layouts)}, found {len(tasks)} on {on}")
     return found
 
 
@@ -162,8 +162,8 @@ def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
     missing = [layout.name for layout in layouts if layout.name not in known]
     if missing:
         raise OptionError(
-            f"{', '.join(missing)}: neither a chosen history nor a task of a manifest is on this layout; leave it out, "
-            f"or choose other filters or manifests"
+            f"{', '.join(missing)}: no chosen history and no task of a manifest is on such a layout; choose other "
+            f"layouts, filters or manifests"
         )
 
 

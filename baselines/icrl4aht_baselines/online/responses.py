@@ -1,7 +1,7 @@
 """Best responses: egos with the benchmark's view, each trained with a single teammate.
 
 The mean return B of a best response estimates what an ego could earn with a teammate that it knows from the start. B is
-a lower bound, because a longer training or another learner may earn more. For comparison, jax-aht trains PPO egos for
+a lower bound, because longer training or another learner may earn more. For comparison, jax-aht trains PPO egos for
 10^7 steps with one teammate; ZSC-Eval trains for 10^7 steps and evaluates on 50 episodes.
 """
 
@@ -53,13 +53,13 @@ PROTOCOL = "seeded"
 """Protocol under which best responses are chosen and measured."""
 
 CHOICE_SEEDS, REPORT_SEEDS = (1000,), (0, 1, 2)
-"""Seeds of the episodes that the best training is chosen by, and seeds of the reported episodes."""
+"""Seeds of the episodes that the best training run is chosen by, and seeds of the reported episodes."""
 
 RESPONSES_FILE = "best_responses.json"
-"""Name of the file of best responses, in a folder of trainings and among the package's cards."""
+"""Name of the file of best responses, in a folder of training runs and among the package's cards."""
 
 RESULT = "result.json"
-"""Name of the file with a training's result, in the folder of the training."""
+"""Name of the file with the result of a training run, in the folder of its job."""
 
 ABOUT = (
     "Best responses: recurrent PPO with the benchmark's 5 x 5 view, trained with one teammate alone, memory cleared "
@@ -119,9 +119,9 @@ class TrainingJob:
 
     Attributes:
         tasks: the tasks that the ego plays.
-        seed: seed of the training.
-        options: settings of the training.
-        out: folder of all trainings.
+        seed: seed of the training run.
+        options: settings of the training run.
+        out: folder of all jobs.
         xla_threads: number of XLA threads on a CPU.
     """
 
@@ -139,7 +139,7 @@ class TrainingJob:
 
     @property
     def name_suffix(self) -> str:
-        """End of the job's name: width and seed, so that trainings of several widths can share an output folder."""
+        """End of the job's name: width and seed, so that jobs of several widths can share an output folder."""
         return f"w{self.options.width}-s{self.seed}"
 
     @property
@@ -180,7 +180,7 @@ class TrainingJob:
         return parse_json(read_text(self.folder / RESULT))
 
     def progress(self) -> tuple[int, float] | None:
-        """Return the number of finished training steps, and environment steps per second; None before the first log."""
+        """Return the finished training steps and the environment steps per second; None before the first log line."""
         timing = last_line(self.folder / "run" / TIMING)
         if timing is None:
             return None
@@ -211,7 +211,7 @@ class TrainingJob:
         params: Any = None,
         told: int = 0,
     ) -> tuple[PlayTrainer, Any]:
-        """Train an ego on groups of tasks, or resume its training. Return the trainer and the parameters.
+        """Train an ego on groups of tasks, or resume a stopped run. Return the trainer and the parameters.
 
         Args:
             layouts: layouts of the tasks.
@@ -298,7 +298,7 @@ class ResponseJob(TrainingJob):
 
 
 def trained_response(job: ResponseJob) -> TrainedResponse:
-    """Return the record of a finished training, for the play mode that earns more on the episodes to choose by."""
+    """Return the record of a finished training run, for the play mode that earns more on the episodes to choose by."""
     result = job.result()
     acting, earned = max(result["modes"].items(), key=lambda mode: mode[1]["choice"])
     steps = job.options.updates * job.options.tasks * KEPT_STEPS
@@ -315,10 +315,10 @@ def trained_response(job: ResponseJob) -> TrainedResponse:
 
 
 def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainedResponse]) -> BestResponse:
-    """Return the best response to tasks whose teammates behave the same, from several trainings.
+    """Return the best response to tasks whose teammates behave the same, from several training runs.
 
-    The training with the highest return on the episodes to choose by is the best; B is its return on the reported
-    episodes. Of several trainings with the same seed, initial model, steps and width, only the last is used.
+    The run with the highest return on the episodes to choose by is the best; B is its return on the reported
+    episodes. Of several runs with the same seed, initial model, steps and width, only the last is used.
     """
     task, seeds = tasks[0], {(one.init, one.steps, one.width, one.seed): one for one in trainings}
     best = chosen_training(seeds.values())
@@ -334,10 +334,10 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainedRespo
 
 
 def include_models(found: BestResponse, models: Mapping[str, Mapping[str, float]]) -> BestResponse:
-    """Return a best response with the return of the best model, if that model earns more than the training.
+    """Return a best response with the return of the best model, if that model earns more.
 
     Args:
-        found: best response by training.
+        found: best response that was trained.
         models: model -> task id -> mean return; models without results in all tasks of `found` are ignored.
     """
     earned = {
@@ -354,13 +354,13 @@ def include_models(found: BestResponse, models: Mapping[str, Mapping[str, float]
 def write_responses(
     jobs: Sequence[ResponseJob], folder: Path, models: Mapping[str, Mapping[str, float]] = MappingProxyType({})
 ) -> Path:
-    """Add the best responses of finished trainings to the file `RESPONSES_FILE` in a folder. Return the file's path.
+    """Add the best responses of finished jobs to the file `RESPONSES_FILE` in a folder. Return the file's path.
 
-    A new entry includes earlier trainings on the same tasks that the file has. Earlier entries that share only some of
+    A new entry includes the file's earlier training runs on the same tasks. Earlier entries that share only some of
     the tasks are removed. The version in the file is a hash of all entries.
 
     Args:
-        jobs: jobs of the trainings; unfinished ones are skipped.
+        jobs: training jobs; unfinished jobs are skipped.
         folder: folder of the file.
         models: model -> task id -> mean return, see `include_models`.
     """
@@ -382,9 +382,9 @@ def write_responses(
 
 
 def responses_table(folder: Path) -> str:
-    """Return a Markdown table of a folder's best responses: B, range of the trainings' returns, and their rise.
+    """Return a Markdown table of a folder's best responses: B, range of the runs' returns, and rise of the best run.
 
-    "rise" is the best training's `slope`; a rise of several points shows that the training was too short.
+    "rise" is the best run's `slope`; a rise of several points shows that training was too short.
     """
     body = []
     for one in read_best_responses(folder / RESPONSES_FILE).behaviours:

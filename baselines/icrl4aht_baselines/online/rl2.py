@@ -65,7 +65,7 @@ class PlayerMemory(NamedTuple):
 
 
 class PlayState(NamedTuple):
-    """State of a training by playing, which is the complete content of a checkpoint.
+    """State of a training run by playing, which is the complete content of a checkpoint.
 
     Attributes:
         params: pytree of float32 arrays.
@@ -177,7 +177,7 @@ class _Player:
         teammates = [mate for group in groups for mate in group.teammates]
         self.tasks = len(teammates)
         sizes = [len(group.teammates) for group in groups]
-        self.ends = np.cumsum(sizes)[:-1]  # where the tasks of each further group begin
+        self.ends = np.cumsum(sizes)[:-1]  # numbers of the first task of each group but the first
         self._hidden = np.repeat([group.hidden for group in groups], sizes)
         told = [group.partners for group in groups if group.partners is not None]
         self._partners = jnp.asarray(np.concatenate(told), jnp.int32) if told else None
@@ -300,7 +300,7 @@ def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"])
 
 
 def _model_policy(method: Method, changes: bool) -> Policy:
-    """Return the policy that samples the model's actions in training; `changes`: whether its view may be changed."""
+    """Return the policy that samples the model's actions in training, with changed views if `changes` is set."""
 
     def init(params: Any, key: Array) -> PlayerMemory:
         return PlayerMemory(no_change(), method.start(0, True), jnp.bool_(False))
@@ -316,7 +316,7 @@ def _model_policy(method: Method, changes: bool) -> Policy:
 
 
 class PlayTrainer:
-    """Training by playing, with the interface of `icrl4aht_baselines.training.trainer.Trainer`.
+    """Trainer of RL^2 by playing, with the interface of `icrl4aht_baselines.training.trainer.Trainer`.
 
     Args:
         method: the method RL^2.
@@ -450,5 +450,5 @@ class PlayTrainer:
 
 
 def imitation_weight(play: PlayOptions, step: Int[Array, ""], steps: int) -> Float[Array, ""]:
-    """Return the weight of the imitation loss in a training step, which falls linearly to 0; `steps`: all steps."""
+    """Return the weight of the imitation loss in a step of a run of `steps` steps, which falls linearly to 0."""
     return play.imitation * jnp.maximum(0.0, 1.0 - step / (play.imitation_end * steps))

@@ -138,7 +138,7 @@ class PlaySession:
         loop, due = asyncio.get_running_loop(), 0.0
         while not self.game.is_over:
             await self._moving.wait()
-            due = max(due + 1 / self.ticks, loop.time())  # after a late step, the next ones keep their distance
+            due = max(due + 1 / self.ticks, loop.time())  # after a late step, later steps keep the interval
             await asyncio.sleep(due - loop.time())
             if self._moving.is_set():
                 await self.advance()

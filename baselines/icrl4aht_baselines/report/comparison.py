@@ -60,7 +60,7 @@ class StoredResults:
 
     Attributes:
         table: table of results, see `results`.
-        curves: mean return in each episode of the test tasks on a layout, over tasks, seeds and trainings, with the
+        curves: mean return in each episode of the test tasks on a layout, over tasks, seeds and training runs, with the
             columns `CURVE_COLUMNS`.
         agents: name of an agent -> facts that tables state; agents are shown in this order.
     """
@@ -95,7 +95,7 @@ def _table_paths(path: Path) -> tuple[Path, Path]:
 
 
 def read_stored(path: Path) -> StoredResults:
-    """Return the results that are stored in a JSON file and in tables next to it; empty ones if the file is missing.
+    """Return the results that are stored in a JSON file and in tables next to it, or empty results if it is missing.
 
     Raises:
         OptionError: if a file is damaged.
@@ -119,25 +119,25 @@ def write_stored(path: Path, stored: StoredResults) -> None:
     for file, frame, digits in zip(_table_paths(path), (stored.table, stored.curves), (3, 2), strict=True):
         with atomic_write(file) as partial:
             text = frame.round(digits).to_csv(index=False, lineterminator="\n")
-            partial.write_bytes(gzip.compress(text.encode(), mtime=0))  # no time: equal results give equal bytes
+            partial.write_bytes(gzip.compress(text.encode(), mtime=0))  # no time stamp, for reproducible files
     with atomic_write(path) as partial:
         write_json(partial, msgspec.to_builtins(stored.agents))
 
 
 def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
-    """Check that submitted results are of an agent without stored results, or update those of a stored agent.
+    """Check that submitted results are of a new agent, or update the results of a stored agent.
 
     Raises:
-        OptionError: if they are neither; the message names the agent.
+        OptionError: if neither is true; the message names the agent.
     """
     known = {agent.casefold(): agent for agent in stored.agents}.get(found.agent.casefold())
     if known and not found.update:
         raise OptionError(
-            f"{where}: the page has results of an agent {known} already; give `icrl4aht-data submit` another --name, "
+            f"{where}: the page already has results of an agent {known}; give `icrl4aht-data submit` another --name, "
             f"or --update if these are new results of the same agent"
         )
     if found.update and found.agent != known:
-        raise OptionError(f"{where}: updates the agent {found.agent}, which the page does not have; leave out --update")
+        raise OptionError(f"{where}: updates the agent {found.agent}, which is not on the page; leave out --update")
 
 
 def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
@@ -348,7 +348,7 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 
 
 def describe_trainings() -> str:
-    """Return sentences on the trainings of the best responses; empty if there are no best responses."""
+    """Return sentences on how the best responses were trained, or an empty string if there are none."""
     behaviours = read_best_responses().behaviours
     trained = [training for one in behaviours for training in one.seeds]
     if not trained:

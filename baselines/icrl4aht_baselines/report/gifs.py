@@ -149,10 +149,10 @@ def restore_ego(source: ResultSource) -> MakeEgo:
         return AGENTS[name]
     folder = details.get("model") or (source.trained or {}).get("run")
     if folder is None:
-        raise OptionError(f"{name} is neither a reference ego, nor a bundled model, nor of a run folder")
+        raise OptionError(f"{name} is neither a reference ego, nor a bundled model, nor a model with a run folder")
     if "model" not in details and not Path(folder).is_dir():
         raise OptionError(f"its run folder {folder} is missing")
     agent = find_agent(folder, **PlayMode.from_details(details)._asdict())
     if agent.details != details:
-        raise OptionError(f"{folder} holds another model than these results are of: {agent.details}, not {details}")
+        raise OptionError(f"{folder} holds another model: expected {details} as in the results, found {agent.details}")
     return agent.make

@@ -11,7 +11,7 @@ A table of results is a data frame with a row for each task, seed and block of e
 
 A result cell never mixes test tasks with other kinds of tasks, since the paper's numbers are of the test tasks.
 
-Shapes: T trainings, U tasks of a cell, S seeds.
+Shapes: T training runs, U tasks of a cell, S seeds.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class CellReturns(NamedTuple):
         seeds: seeds of the episodes.
         blocks: block of episodes -> mean returns, float64 (T, U, S), see `BLOCKS`.
         overlaps: kinds of overlap of the tasks with the training data.
-        trainings: numbers of the agent's trainings.
+        trainings: numbers of the agent's training runs.
     """
 
     tasks: tuple[str, ...]
@@ -122,7 +122,7 @@ class CellReturns(NamedTuple):
 
     @property
     def mean(self) -> np.ndarray:
-        """Mean returns over all episodes and trainings, float64 (U, S)."""
+        """Mean returns over all episodes and training runs, float64 (U, S)."""
         return self.blocks["all"].mean(axis=0)
 
 
@@ -146,7 +146,7 @@ def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
         overlaps = sorted_overlaps(" ".join(rows["overlap"].unique()).split())
         cell = ResultCell._make(map(str, key))
         if np.isnan(values).any():
-            raise OptionError(f"{cell.title}: the results of the trainings have unequal tasks, seeds or episodes")
+            raise OptionError(f"{cell.title}: expected equal tasks, seeds and episodes in all runs, found unequal ones")
         trainings, seeds = (tuple(map(int, axes[number])) for number in (0, 2))
         found[cell] = CellReturns(tuple(axes[1]), seeds, blocks, overlaps, trainings)
     return {cell: found[cell] for cell in in_order(found)}
@@ -181,7 +181,7 @@ class ResultSource(NamedTuple):
         return tuple(dict.fromkeys(cell.layout for cell in self.tasks))
 
     def detail(self, name: str) -> Any:
-        """Return an entry of the agent's `details`, such as `encoder`; an empty text if there is no such entry."""
+        """Return an entry of the agent's `details`, such as `encoder`; an empty string if there is no such entry."""
         return self.settings.get("details", {}).get(name, "")
 
     @property
@@ -273,7 +273,7 @@ def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] =
     if run is not None:
         config = read_config(run)
         if "histories" not in config:
-            raise OptionError(f"{run}: its config.json has no `histories`: expected a run on learning histories")
+            raise OptionError(f"{run}: its config.json has no `histories`: expected a run that trained on histories")
         content = {
             "run": str(run.resolve()),
             "run_hash": json_hash(config),
@@ -359,7 +359,7 @@ def as_run(
     """
     settings = results[0].settings
     if any(result.settings != settings for result in results):
-        raise OptionError(f"{where}: results of different settings in one run")
+        raise OptionError(f"{where}: expected results with equal settings, found different settings; evaluate again")
     known = bundled_by_id("test") | {task.task_id: task for task in tasks}
     if any(result.task_id not in known for result in results):
         known = bundled_by_id("validation") | bundled_by_id("diverse") | known

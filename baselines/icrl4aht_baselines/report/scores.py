@@ -5,7 +5,7 @@ layout is N = sum(R - S) / sum(B - S) over its tasks; the score of several layou
 (layout and teammate family) has headroom if its mean of B - S is at least `LEAST_HEADROOM`; only tasks of such cells
 are used.
 
-Shapes: T trainings, U tasks of a cell, S seeds.
+Shapes: T training runs, U tasks of a cell, S seeds.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def bundled_cells() -> dict[ResultCell, list[str]]:
 
 
 def behaviour_names() -> dict[str, str]:
-    """Return label of a task -> name of its teammate's behaviour, which is the id of the first task with it.
+    """Return label of a task -> name of its teammate's behaviour, which is the id of the first such task.
 
     The result covers the package's test tasks and all tasks with best responses.
     """
@@ -114,7 +114,7 @@ def behaviour_names() -> dict[str, str]:
 def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
     """Return result cell -> reference returns under a protocol, for cells whose tasks all have best responses.
 
-    A layout's test cells are included only if all of them in which the oracle earns more than `stay` are complete.
+    A layout's test cells are included only if those in which the oracle earns more than `stay` all have best responses.
     """
     measured, stays, names = best_responses(protocol), stay_returns(protocol), behaviour_names()
     found: dict[ResultCell, CellScale] = {}
@@ -280,7 +280,7 @@ def block_difference(
 
 
 def paired(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:
-    """Return two agents' results in a cell, reduced to common tasks, seeds and trainings in the same order."""
+    """Return two agents' results in a cell, reduced to common tasks, seeds and training runs in the same order."""
     axes = [(of.trainings, of.tasks, of.seeds) for of in (one, other)]
     common = [tuple(key for key in first if key in second) for first, second in zip(*axes, strict=True)]
 

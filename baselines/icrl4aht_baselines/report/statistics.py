@@ -3,10 +3,10 @@
 Intervals are studentised bootstrap intervals (Efron and Tibshirani 1993, ch. 12.5). With five teammates, percentile
 intervals would be too narrow by a tenth, since the variance of resamples is (n - 1) / n of the true variance; dividing
 by the standard error of each resample corrects this. Teammates' behaviours are resampled within a combination of layout
-and family, or the seeds if it has a single behaviour. Trainings are resampled for all combinations together. The random
-generator has a fixed seed, so that results are reproducible.
+and family, or the seeds if it has a single behaviour. Training runs are resampled for all combinations together. The
+random generator has a fixed seed, so that results are reproducible.
 
-Shapes: T trainings, U units of a stratum (behaviours, or seeds), S seeds, R resamples.
+Shapes: T training runs, U units of a stratum (behaviours, or seeds), S seeds, R resamples.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ class MeanInterval(NamedTuple):
 
 
 class Stratum(NamedTuple):
-    """Units of one group, among which resamples are made.
+    """Units of one group, within which units are resampled.
 
     Attributes:
-        gains: numerators of the units in each training, (T, U).
+        gains: numerators of the units in each training run, (T, U).
         scales: denominators of the units, (U,).
     """
 
@@ -80,7 +80,7 @@ def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMP
     """Return the mean over groups of the ratio sum(gains) / sum(scales), with its 95 % interval.
 
     Args:
-        groups: strata of each group; all strata have the same trainings.
+        groups: strata of each group; all strata have the same training runs.
         resamples: number of resamples.
     """
     if not groups:
@@ -119,7 +119,7 @@ def _estimate(groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R
 
     Args:
         groups: strata with gains (R, T, U) and scales (R, U).
-        weights: share of each training in each resample, (R, T).
+        weights: share of each training run in each resample, (R, T).
     """
     by_training, variance = np.zeros_like(weights), np.zeros(len(weights))
     for group in groups:

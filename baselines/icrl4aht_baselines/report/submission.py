@@ -66,7 +66,7 @@ class Evaluation(msgspec.Struct, forbid_unknown_fields=True):
     Attributes:
         control: name of a control, see `protocols.CONTROLS`, or of another play mode, see `egos.OTHER_WAYS`; empty for
             the agent's main results.
-        training: number of the agent's training, if there are several with different seeds.
+        training: number of the agent's training run, if there are several with different seeds.
         settings: settings of the results, see `evaluate.results.Result`; the details state `trained_on`.
         returns: task id -> return of each episode, as one list per seed.
     """
@@ -110,7 +110,7 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
 
     Args:
         folders: folders with results of one agent. Folders with the same tasks and play mode are of different
-            trainings, in this order. Controls of the agent's other play mode are left out.
+            training runs, in this order. Controls of the agent's other play mode are left out.
         facts: facts about the agent that the page states.
         agent: name of the agent in tables; by default the name in the results.
         update: see `Submission`.
@@ -118,7 +118,7 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
     Raises:
         OptionError: for the reasons of `check_submission`, or if a folder has no results or results of other settings.
     """
-    counts: Counter[tuple[str, str]] = Counter()  # (play mode, task) -> number of trainings so far
+    counts: Counter[tuple[str, str]] = Counter()  # (play mode, task) -> number of training runs so far
     evaluations, tasks, training, way = [], set(), 0, ""
     for folder in folders:
         for control in ("", *CONTROLS):
@@ -133,7 +133,7 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
             declared = (trained or {}).get("config", {})
             if TRAINED_ON not in details and TRAINED_ON in declared:
                 details[TRAINED_ON] = declared[TRAINED_ON]
-            if not control:  # controls belong to the training of their folder
+            if not control:  # the controls in a folder are of the same training run
                 way = next((one for one in OTHER_WAYS if settings["agent"].endswith(f" ({one})")), "")
                 training = max(counts[way, result.task_id] for result in results)
                 counts.update((way, result.task_id) for result in results)
@@ -187,8 +187,8 @@ def check_submission(found: Submission, where: str) -> None:
             raise OptionError(f"{part}: two results of a task, expected one; give each folder only once")
     if not found.update and not any(one.control == "" for one in found.evaluations):
         raise OptionError(
-            f"{where}: only results of controls or of another play mode, expected results of the agent itself; give "
-            f"their folder as well, or --update if the page has them"
+            f"{where}: expected results of the agent itself, found only controls or another play mode; give the "
+            f"folder of the agent's results as well, or --update if they are on the page"
         )
 
 
@@ -267,14 +267,14 @@ def read_submission(path: Path) -> Submission:
         found = msgspec.json.decode(path.read_bytes(), type=Submission)
     except msgspec.MsgspecError as error:
         raise OptionError(
-            f"{path}: not a file of results: {error}; `icrl4aht-data submit` makes them from folders of `evaluate`"
+            f"{path}: not a file of results: {error}; `icrl4aht-data submit` makes such files from `evaluate` results"
         ) from error
     check_submission(found, str(path))
     return found
 
 
 def submitted_runs(found: Submission) -> list[tuple[Evaluation, EvaluationRun]]:
-    """Return pairs of each evaluation in a submission and its results as an `EvaluationRun`."""
+    """Return each evaluation of a submission together with its results as an `EvaluationRun`."""
     return [
         (one, as_run([Result(task, one.settings, returns) for task, returns in one.returns.items()], found.agent))
         for one in found.evaluations

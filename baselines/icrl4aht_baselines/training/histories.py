@@ -41,7 +41,7 @@ _CELL_FIELDS = {"layout": "layout", "split": "split", "family": FILTERS["teammat
 
 
 def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> TrainingTask:
-    """Return the training of a method on histories; with several processes, each gets its share of the batches.
+    """Return the training task of a method on histories; each of several processes gets its share of the batches.
 
     The held-out part `teammates` consists of the release's validation histories on the training layouts that pass the
     same filters. If there are none, some teammates of the training split are held out instead, see `hold_out`.
@@ -111,7 +111,7 @@ def history_settings(dataset: Dataset) -> dict[str, Any]:
 
 
 def _batch_view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | None:
-    """Return the function from batches to observations for a training; None for unchanged state records."""
+    """Return the training's function from batches to observations; None for unchanged state records."""
     changed = [f"mirror = {mirror}"] * mirror + [f"hide_recipe = {', '.join(hidden)}"] * bool(hidden)
     if changed and (dataset.obs != "state" or dataset.channels != "canonical"):
         raise OptionError(
@@ -132,7 +132,7 @@ def _load_histories(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]
         The chosen training histories, and the validation histories that pass the same filters, or None.
     """
     every = ALL_LAYOUTS in histories.layouts
-    release = load_icrl4aht(histories.root, obs="uint8")  # first, because it may define additional layouts
+    release = load_icrl4aht(histories.root, obs="uint8")  # opened first, since it may define layouts
     names = None if every else [get_layout(name).name for name in histories.layouts]
     found = filter_histories(release.filter(split="train", layout=names), histories.filters)
     differ = len({layout.obs_shape for layout in found.layouts}) > 1
@@ -166,14 +166,14 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -
         for value in values:
             if value not in found:
                 raise EmptySelectionError(
-                    f"{name} = {value}: none of {dataset!r}; these have {', '.join(found)}: choose among them, or "
+                    f"{name} = {value}: not in {dataset!r}, which has {', '.join(found)}; choose one of these, or "
                     f"another layout or release"
                 )
     if not passing.any():
         wanted = ", ".join(f"{name} = {' or '.join(values)}" for name, values in filters.items())
         raise EmptySelectionError(
-            f"{wanted}: none of {dataset!r} has these together: leave one of them out, or choose another layout or "
-            f"release"
+            f"{wanted}: no history of {dataset!r} has all of these values; leave out an option, or choose another "
+            f"layout or release"
         )
     return dataset.select(passing) if filters else dataset
 
@@ -250,7 +250,7 @@ def _sampler(
     if options.context > steps:
         raise OptionError(
             f"context = {options.context}: the shortest history of {dataset!r} has {steps} steps for a window, with "
-            f"every = {every} and first = {histories.first or 'all'}; take fewer, or choose longer histories"
+            f"every = {every} and first = {histories.first or 'all'}; reduce the context, or choose longer histories"
         )
     return dataset.ad(length=options.context, every=every, **shared)
 
@@ -330,12 +330,12 @@ class TrainedModel(NamedTuple):
 
 
 def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
-    """Return the parameters of a run, to start another training from, and add the run to that training's settings.
+    """Return the parameters of a run, to start a new run from, and add the given run to the new run's settings.
 
     Args:
         run: run folder to take the parameters from.
-        method: method of the new training.
-        about: settings of the new training, to which the run and its record of training data are added.
+        method: method of the new run.
+        about: settings of the new run, to which the run and its record of training data are added.
 
     Raises:
         OptionError: if the parameters are of another model; the message states the options that differ.
@@ -348,7 +348,7 @@ def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
             for name, one in ((config["method"], config), (method.name, about))
         )
         listed = "; ".join(f"{k} = {a!r}, not {b!r}" for k, (a, b) in differing_settings(found, expected).items())
-        raise OptionError(f"{run}: its parameters are of another model ({listed}): give its options, or another run")
+        raise OptionError(f"{run}: its parameters are of another model ({listed}); give these options, or another run")
     about["init"] = {"run": before.hash, "step": before.step}
     about[TRAINED_ON] = [*about[TRAINED_ON], *(cell for cell in before.trained_on if cell not in about[TRAINED_ON])]
     return before.params
@@ -378,12 +378,12 @@ def read_trained(folder: Path) -> TrainedModel:
         raise OptionError(f"{folder}: its config.json is not of a run on learning histories: {error!r}") from error
     if expected != obs_shape:
         raise OptionError(
-            f"{folder}: trained on observations {obs_shape}, those of {layouts[0].name} with {channels} channels are "
+            f"{folder}: trained on observations {obs_shape}, but {layouts[0].name} with {channels} channels has "
             f"{expected} in this version; train again"
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
-    label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # the encoders words and paper compute the same
+    label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # `words` and `paper` compute equal features
     names, digest = tuple(layout.name for layout in layouts), json_hash(config)
     hidden = tuple(histories.get("hide_recipe", ()))
     return TrainedModel(

@@ -1,4 +1,4 @@
-"""Loggers of a training, which write the numbers of metrics.jsonl for TensorBoard, Weights & Biases and Trackio.
+"""Loggers of a training run, which write the numbers of metrics.jsonl for TensorBoard, Weights & Biases and Trackio.
 
 Nothing is uploaded, unless one of the environment variables `WANDB_MODE=online`, `TRACKIO_SPACE_ID` and
 `TRACKIO_SERVER_URL` is set. When a run resumes, each logger is restarted with the complete log, so no step is repeated.
@@ -69,12 +69,12 @@ def _wandb(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
 
 @contextmanager
 def _trackio(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
-    """Log to a Trackio database in the run's folder, or where environment variables such as `TRACKIO_DIR` say."""
+    """Log to a Trackio database in the run's folder, or in the folder that `TRACKIO_DIR` or similar variables name."""
     from huggingface_hub import constants
 
     wanted = os.environ.get("TRACKIO_DIR") or str(folder.absolute())
     with _temporary_entry(os.environ, "TRACKIO_DIR", wanted):
-        import trackio  # reads the variable only at the first import
+        import trackio  # only the first import reads the variable
         from trackio.utils import TRACKIO_DIR as used
     if used != Path(wanted):
         raise OptionError(
@@ -117,7 +117,7 @@ def check_loggers(names: Iterable[str]) -> None:
 
 @contextmanager
 def open_loggers(names: Iterable[str], metrics: Path, config: Mapping[str, Any]) -> Iterator[list[LogLine]]:
-    """Context of open loggers, which first receive the log so far.
+    """Context manager of open loggers, which first receive the log lines written so far.
 
     Args:
         names: names of loggers, from `LOGGER_NAMES`.
@@ -153,7 +153,7 @@ def _prefixed(line: Mapping[str, Any]) -> dict[str, float]:
 
 @contextmanager
 def _temporary_entry(mapping: MutableMapping[str, Any], name: str, value: Any) -> Iterator[None]:
-    """Context in which an entry of a mapping has another value."""
+    """Context manager that temporarily gives an entry of a mapping another value."""
     before = mapping.get(name)
     mapping[name] = value
     try:

@@ -1,4 +1,4 @@
-"""Options of trainings and of the choice of histories; imports no JAX, so that the help of commands is quick."""
+"""Options of training and of the choice of histories; imports no JAX, so that help texts are printed quickly."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class ResponseOptions:
         init: name of a bundled rl2 model to start from; None for random parameters.
     """
 
-    steps: Annotated[Count, Option("Environment steps of a training.")] = 3_000_000
+    steps: Annotated[Count, Option("Environment steps of a training run.")] = 3_000_000
     tasks: Annotated[Count, Option("Episodes that are played at once.")] = 128
     learning_rate: Annotated[Positive, Option("Highest learning rate.")] = 1e-3
     width: Annotated[
@@ -102,7 +102,7 @@ class ResponseOptions:
         return max(1, self.steps // (self.tasks * KEPT_STEPS))
 
     def training(self, seed: int) -> TrainOptions:
-        """Return the options of the trainer for a training with this seed."""
+        """Return the options of the trainer for a run with this seed."""
         settings = {**RL2_SETTINGS["train"], "steps": self.updates, "batch_size": self.tasks, "seed": seed}
         return replace(TrainOptions(**settings), learning_rate=self.learning_rate, save_every=self.updates)
 

@@ -118,7 +118,7 @@ def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[s
 
 
 def overlap_marks(overlaps: Iterable[str]) -> str:
-    """Return the marks of kinds of overlap as text, such as " †§"; empty without overlap."""
+    """Return the marks of kinds of overlap as text, such as " †§"; an empty string without overlap."""
     marks = "".join(OVERLAPS[name][0] for name in sorted_overlaps(overlaps))
     return f" {marks}" if marks else ""
 

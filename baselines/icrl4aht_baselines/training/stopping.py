@@ -1,4 +1,4 @@
-"""Stop a training by a signal without loss of progress."""
+"""Stop a training run by a signal without loss of progress."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class TrainingStopped(SystemExit):
-    """Exit after a signal stopped a training and its state was saved. The exit code is 128 + the signal's number.
+    """Exit of a training run that a signal stopped, after its state was saved. The code is 128 + the signal's number.
 
     Args:
         number: number of the signal.

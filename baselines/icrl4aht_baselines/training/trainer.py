@@ -52,7 +52,7 @@ def show_steps(show: Callable[..., None], name: str, steps: int) -> StepProgress
 
 
 class TrainingData(NamedTuple):
-    """Samplers of a training, with the methods `batch` and `empty` of `icrl4aht_data.sampling.base.Sampler`.
+    """Samplers of a training run, with the methods `batch` and `empty` of `icrl4aht_data.sampling.base.Sampler`.
 
     Attributes:
         train: sampler of the batches to train on.
@@ -64,7 +64,7 @@ class TrainingData(NamedTuple):
 
 
 class TrainState(NamedTuple):
-    """State of a training, which is the content of a checkpoint.
+    """State of a training run, which is the content of a checkpoint.
 
     Attributes:
         params: pytree of float32 arrays.
@@ -286,7 +286,7 @@ class TrainingTask(NamedTuple):
                 if step % options.validate_every == 0 or last:
                     lines += trainer.validation_lines(state, self.data.validation, step)
                 if lines:
-                    waited = getattr(batches, "waited", 0.0)  # without a loader, as in training by playing, 0
+                    waited = getattr(batches, "waited", 0.0)  # methods that learn by playing have no loader
                     now = step, time.perf_counter(), waited
                     steps, seconds, waited = np.subtract(now, before)
                     speed = {"steps_per_second": round(steps / seconds, 4), "loader_wait": round(waited / seconds, 4)}
@@ -300,7 +300,7 @@ class TrainingTask(NamedTuple):
                 if stopped_by:
                     name = signal.Signals(stopped_by).name
                     where = f"{folder}: stopped by {name} after step {step} of {options.steps}"
-                    raise TrainingStopped(stopped_by, f"{where}, whose state is saved; the same command resumes it")
+                    raise TrainingStopped(stopped_by, f"{where}; its state is saved, and the same command resumes it")
             if writes and can_draw():
                 plot_training_log(folder / METRICS, folder / RUN_CURVES, self.method.name)
         return state

@@ -182,7 +182,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
 
 
 def published_environment(layout: str, teammate: str, **options: Any) -> TaskEnv:
-    """Return the environment of a published test task; entry point of the ids registered with Gymnasium.
+    """Return the environment of a published test task; Gymnasium calls this function for registered ids.
 
     Args:
         layout: name of the layout.
@@ -216,7 +216,7 @@ class _StepResult(NamedTuple):
 def _compiled_functions(
     layout: Layout, policy: Policy, canonical: bool
 ) -> tuple[Callable[..., tuple[_RunningEpisode, Array]], Callable[..., _StepResult]]:
-    """Return two compiled functions for a layout and a teammate family: start an episode, and play a step."""
+    """Return two compiled functions for a layout and a teammate family: one starts an episode, one plays a step."""
     env = Environment(layout)
     teammate = lambda params: policy_player(env, policy, params, TEAMMATE, 1)  # noqa: E731
 

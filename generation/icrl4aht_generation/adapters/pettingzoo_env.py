@@ -167,7 +167,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
 
 @lru_cache(maxsize=16)
 def _compiled_functions(layout: Layout, canonical: bool) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return two compiled functions for a layout: start an episode, and play a step."""
+    """Return two compiled functions for a layout: one starts an episode, the other plays a step."""
     env = Environment(layout)
 
     def start(key, record):

@@ -161,7 +161,7 @@ def follow_oracle(
         The oracle's actions, int32 (T, E).
     """
     env, script = Environment(layout), oracle(layout)
-    keys = jax.random.split(jax.random.key(0), records.shape[1])  # no effect: the oracle is deterministic
+    keys = jax.random.split(jax.random.key(0), records.shape[1])  # not used by the deterministic oracle
     zero = jnp.zeros(len(keys), jnp.int32)
 
     def step(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:

@@ -26,7 +26,7 @@ class CollectionJob:
         work: unit of work: a task with a source and a learner.
         profile: profile that the unit belongs to.
         artefacts: folder of all artefacts.
-        suite: folder of the learned teammates; None if no task has one.
+        suite: folder of the learned teammates; None if no task has a learned teammate.
         layouts: all generated layouts of the profile, since every worker compiles for the largest of these layouts.
     """
 

@@ -41,7 +41,7 @@ from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.teammates.registry import build_teammate
 
-_LINE_BYTES = 100  # upper bound of the bytes of a line in metrics or timing
+_LINE_BYTES = 100  # maximum size of a line in the files of metrics or timing
 
 
 def _array_shapes(layout: Layout, config: NoiseConfig) -> dict[str, tuple[tuple[int, ...], str]]:

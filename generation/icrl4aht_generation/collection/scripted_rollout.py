@@ -80,7 +80,7 @@ class ScriptedEpisodes(NamedTuple):
 
 
 class NoisyChoice(NamedTuple):
-    """Actions of a script with random actions in one step of M environments.
+    """Actions of a scripted ego in one step of M environments, some replaced by random actions.
 
     Attributes:
         action: int32 (M,), the action taken.
@@ -97,7 +97,7 @@ ScriptedBatch = tuple[np.ndarray, np.ndarray]
 
 def scripted_batches(source: str, config: NoiseConfig) -> list[ScriptedBatch]:
     """Return the batches of episodes of a task, in the order of play."""
-    if source == "search":  # one episode of all histories at once, because the script remembers earlier episodes
+    if source == "search":  # a batch has one episode per history, as the script remembers earlier episodes
         histories = np.arange(config.histories)
         return [(histories, np.full_like(histories, episode)) for episode in range(config.episodes)]
     episodes = config.histories * config.episodes
@@ -146,7 +146,7 @@ def play_scripted_histories(
 
 
 def scripted_episode_keys(seed: int, history: np.ndarray, episode: np.ndarray) -> Key[Array, " M"]:
-    """Return the environment keys of some episodes of a task; every episode is the first of its environment.
+    """Return the environment keys of the given episodes of a task; every episode is the first of its environment.
 
     Args:
         seed: the task's seed.
@@ -195,7 +195,7 @@ def _compiled_play(teammate: Policy, searches: bool) -> Callable[..., tuple[Scri
             actions=by_episode(choice.action),
             teammate_actions=by_episode(rollout.actions[..., TEAMMATE]),
             rewards=by_episode(rollout.reward),
-            episode_end_state=carry.env.record,  # not reset yet: training episodes have more steps
+            episode_end_state=carry.env.record,  # not reset yet, as the environment's episodes are longer
             script_actions=by_episode(choice.clean),
         )
         return episodes, carry.memories[EGO] if searches else None

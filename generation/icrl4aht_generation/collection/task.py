@@ -75,7 +75,7 @@ def saved_progress(saved: StateFile) -> int:
     """Return the number of updates saved under the same settings; without a save, empty the folder and return 0."""
     try:
         done = saved.progress
-    except OtherSettingsError:  # made by another profile or version, so it cannot be resumed
+    except OtherSettingsError:  # another profile or version saved this state, so it cannot be resumed
         done = None
     if done is None:
         shutil.rmtree(saved.path.parent, ignore_errors=True)

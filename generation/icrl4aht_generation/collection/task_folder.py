@@ -56,7 +56,7 @@ METADATA, LEARNER = "metadata.json", "learner.safetensors"
 LABELLER_RETURNS = "labeller_returns.json"
 """File with the mean returns of the ego's checkpoints, which packing adds to choose the labeller."""
 
-_LINE_BYTES = 600  # upper bound of the bytes of an update's lines in metrics and timing
+_LINE_BYTES = 600  # maximum size of an update's lines in the files of metrics and timing
 
 
 SCRIPT_ARRAYS = ("script_actions", "noise")
@@ -100,10 +100,10 @@ def arrays_bytes(shapes: Mapping[str, tuple[tuple[int, ...], str]]) -> int:
 
 
 def record_rollout(histories: HistoryArrays, update: int, rollout: Rollout) -> None:
-    """Write the steps of a rollout that are stored into the histories.
+    """Write those steps of a rollout that the histories store.
 
-    All environments start episodes in the same steps, so a step's number determines its episode and its clock. Writing
-    a rollout twice changes nothing, so a resumed task may write it again.
+    All environments start episodes in the same steps, so a step's number determines its episode and its step in the
+    episode. Writing a rollout twice changes nothing, so a resumed task may write it again.
     """
     length = rollout.record.shape[0]
     step = np.arange(update * length, (update + 1) * length)
@@ -122,7 +122,7 @@ def record_rollout(histories: HistoryArrays, update: int, rollout: Rollout) -> N
 
 
 def partial_folder(folder: Path) -> Path:
-    """Return the folder of an artefact while it is not finished."""
+    """Return the folder of an unfinished artefact, given the folder of the finished artefact."""
     return folder.with_name(f"{folder.name}.partial")
 
 
@@ -208,7 +208,7 @@ def reserve_disk(partial: Path, needed: int) -> Iterator[None]:
             shutil.rmtree(partial, ignore_errors=True)
         raise DiskFullError(
             f"{partial.with_name(partial.name.removesuffix('.partial'))}: the disk is full: this task needs "
-            f"{needed:,} bytes, {free:,} are free; free some space, or give another --out"
+            f"{needed:,} bytes, but only {free:,} are free; free some space, or give another --out"
         ) from error
 
 

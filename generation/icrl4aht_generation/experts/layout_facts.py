@@ -1,4 +1,4 @@
-"""Facts about a layout that the oracle uses, computed in advance with NumPy: reachable cells and travel times.
+"""Properties of a layout that the oracle uses, precomputed with NumPy, such as reachable cells and travel times.
 
 Shapes: `cells` cells, `P` pots, `O` obstacles. All times are in steps.
 """
@@ -23,7 +23,7 @@ NEVER = 10_000
 
 
 class LayoutFacts(NamedTuple):
-    """Facts about a layout, computed before an episode: NumPy arrays, or traced arrays in a compiled function.
+    """Precomputed properties of a layout: NumPy arrays, or traced arrays in a compiled function.
 
     Attributes:
         matters: bool (), whether the ego can serve, or reaches a pot or a counter that the teammate also reaches.
@@ -61,12 +61,12 @@ class LayoutFacts(NamedTuple):
 
 
 def stack_facts(layouts: Sequence[Layout]) -> LayoutFacts:
-    """Return the facts of several layouts, padded to the largest and stacked on a new first axis."""
+    """Return the `LayoutFacts` of several layouts, padded to the largest and stacked on a new first axis."""
     return stack_padded([study_layout(layout) for layout in layouts], {"ways": NOWHERE, "leg": NOWHERE, "trip": FAR})
 
 
 def study_layout(layout: Layout) -> LayoutFacts:
-    """Compute the facts of one layout."""
+    """Compute the `LayoutFacts` of one layout."""
     kinds, tables = layout.kinds, layout.tables
     # An agent reaches the cells that it can face, so both agents reach a counter between their rooms.
     mine, theirs = (np.isin(np.arange(layout.cells), layout.ahead[room]) for room in layout.rooms)
@@ -122,7 +122,7 @@ def _steps_or_far(steps: np.ndarray, far: int) -> np.ndarray:
 
 
 def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
-    """Return `LayoutFacts.ways`: the steps of the shortest walk whose last move ends facing a cell."""
+    """Return `LayoutFacts.ways`: the steps of the shortest walk from each cell until the ego faces each other cell."""
     room = layout.rooms[EGO].astype(int)
     position = np.zeros(layout.cells, int)  # index of each cell within the ego's room
     position[room] = range(len(room))
@@ -133,7 +133,7 @@ def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
     for action in range(4):
         end = ends[..., action]
         faced = layout.ahead[end, FACING_OF[action]].astype(int)
-        # At most two cells lead to facing the same cell: from one the agent walks, on the other it only turns.
+        # An action makes the agent face a given cell from at most two cells: it walks from one, and turns on the other.
         for walks in (False, True):
             obstacle, start = np.nonzero((end != room) == walks)
             own = obstacle[:, None], room, faced[obstacle, start][:, None]
@@ -151,7 +151,7 @@ def _walking_steps(ends: np.ndarray) -> np.ndarray:
     steps = np.tile(steps.astype(np.uint8), (len(ends), 1, 1))
     each = np.arange(len(ends))[:, None]
     total = None
-    while total != (total := int(steps.sum())):  # until no walk becomes shorter
+    while total != (total := int(steps.sum())):  # repeat until no walk becomes shorter
         for action in range(ends.shape[2]):  # updating in place between actions halves the number of passes
             after = np.minimum(steps[each, ends[..., action]], NOWHERE - 3)
             np.minimum(steps, after + 1, out=steps)

@@ -70,7 +70,7 @@ def oracle(layout: Layout | Sequence[Layout]) -> Policy:
 
 
 def oracle_params(layouts: Sequence[Layout]) -> Any:
-    """Return the parameters of `SITUATION_ORACLE`: the facts of some layouts, and an empty state record."""
+    """Return the parameters of `SITUATION_ORACLE`: stacked `LayoutFacts` of the layouts, and an empty state record."""
     return stack_facts(layouts), np.zeros(record_size(*layouts), np.uint8)
 
 
@@ -80,7 +80,7 @@ def _initial_memory(params: Any, key: Key[Array, ""]) -> OracleMemory:
 
 
 def _act(params: Any, memory: OracleMemory, view: Situation, key: Key[Array, ""]):
-    # The facts of all layouts are stacked, so one compiled function plays any layout.
+    # The `LayoutFacts` of all layouts are stacked, so one compiled function plays any layout.
     facts = LayoutFacts(*(jnp.asarray(leaf)[view.layout] for leaf in params[0]))
     scene = Scene(view.tables, view.record, EGO)
     memory = _update_memory(scene, memory)
@@ -119,7 +119,7 @@ class OracleView(NamedTuple):
     """Features of one state from the ego's point of view, as traced arrays.
 
     Attributes:
-        facts: facts of the layout.
+        facts: precomputed properties of the layout.
         scene: the state from the ego's point of view.
         memory: memory of the ego.
         obstacle: int32 (), number of the obstacle in `LayoutFacts.ways`.
@@ -162,7 +162,7 @@ class OracleView(NamedTuple):
         return self.recipes[0] | _DISH
 
     def cost(self, mask: Bool[Array, " cells"] | np.ndarray, then: Array | int = 0) -> Int[Array, " cells"]:
-        """Return the steps to each cell of a mask plus the later steps `then`; NEVER for other cells."""
+        """Return the steps to each cell of a mask, plus `then` further steps. All other cells cost NEVER."""
         return jnp.where(mask & self.facts.mine, self.time + then, NEVER)
 
     @property
@@ -176,13 +176,13 @@ class OracleView(NamedTuple):
         return _steps(jnp.asarray(self.facts.leg))
 
     def cost_at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:
-        """Return the steps to each cell of the given pots plus the later steps `then`; NEVER for other cells."""
+        """Return the steps to each of the given pots, plus `then` further steps. All other cells cost NEVER."""
         there = jnp.where(which & self.facts.pots, self.pot_times + then, NEVER)
         return jnp.where(self.scene.cells_of_kind(POT), self.scene.at(POT, there), NEVER)
 
     @property
     def parking_cost(self) -> Int[Array, " cells"]:
-        """Cost of putting an item on each counter: low out of the teammate's reach, or near a pot if it only cooks."""
+        """Cost of each counter for putting down an item; low if unshared, or near pots if the ego only cooks."""
         facts = self.facts
         near = 2 * jnp.min(self.steps_to_pots, axis=1, initial=FAR)
         return self.cost(self.scene.empty_counters, jnp.where(facts.serves, 3 * jnp.asarray(facts.shared), near))
@@ -194,13 +194,13 @@ class OracleView(NamedTuple):
 
     @property
     def plan_costs(self) -> Int[Array, "P Q"]:
-        """Cost of cooking each recipe in each pot: prefers recipes with few soups in stock, then little work."""
+        """Cost of cooking each recipe in each pot; lower for recipes with few soups in stock, then with little work."""
         trip = jnp.asarray(self.facts.trip)[:, None]
         enough = jnp.all((self.missing >= 0) & ((self.missing == 0) | (trip < FAR)), axis=-1)
         # A surplus ingredient makes a recipe impossible: nothing can be taken out of a pot.
         possible = enough & (self.facts.pots & ~self.full)[:, None]
         current, short = self.recipes == self.recipes[0], self.stock[0] == 0
-        # If the teammate cooks, cook ahead only in pots it does not use, or when the current recipe is impossible.
+        # If the teammate cooks, cook ahead only in pots that it does not use, or if the current recipe is impossible.
         wanted = jnp.where(short, current, jnp.asarray(self.facts.passed)[:, None]) | (short & ~jnp.any(possible[:, 0]))
         work = jnp.sum(self.missing * jnp.minimum(trip, FAR // 10), axis=-1)
         # A soup in stock counts more than any walk, because walks are shorter than 200 steps.
@@ -218,8 +218,8 @@ class OracleView(NamedTuple):
         return self.risky | ((self.stock[0] == 0) & (jnp.min(self.plan_costs[:, 0]) == NEVER))
 
     @property
-    def left_to_teammate(self) -> Bool[Array, " P"]:
-        """Soups left for the teammate to serve: the first right soup, if the teammate also cooks and is not idle."""
+    def teammate_pots(self) -> Bool[Array, " P"]:
+        """Pots left to the teammate: that of the first right soup, if the teammate also cooks and is not idle."""
         first = jnp.arange(len(self.timers)) == jnp.argmin(jnp.where(self.right, self.timers, NEVER))
         elsewhere = (self.scene.partner_hand & COOKED > 0) | (
             self.scene.holds_plate & (self.scene.partner_hand != PLATE)
@@ -293,7 +293,7 @@ def _first_move(view: OracleView, obstacle: Int[Array, ""] | int, target: Int[Ar
 
 
 class Subgoal(NamedTuple):
-    """Row of the ego's decision table: go to the cheapest cell and interact.
+    """Row of the ego's decision table: a condition, and the costs of the cells at which the ego can interact.
 
     Attributes:
         when: bool (), whether the subgoal applies.
@@ -338,7 +338,7 @@ def _dish_subgoals(view: OracleView) -> list[Subgoal]:
 
 def _plate_subgoals(view: OracleView) -> list[Subgoal]:
     holds, building = view.scene.holds_plate, jnp.min(view.plan_costs) < NEVER
-    right = view.right & ~view.left_to_teammate
+    right = view.right & ~view.teammate_pots
     soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
     # The ego waits in front of a soup that is not done, so waiting counts like walking.
     rest = jnp.maximum(view.timers - view.pot_times, 0)
@@ -396,7 +396,7 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
     # The earliest step in which the ego can face each pot after it has fetched a plate.
     arrival = jnp.min(jnp.where(view.plate_cells[:, None], view.time[:, None] + to_pot, NEVER), axis=0)
     due = view.timers <= arrival + 2
-    right = view.right & ~view.left_to_teammate & facts.serves
+    right = view.right & ~view.teammate_pots & facts.serves
     wrong = view.full & ~view.right & view.must_clear & facts.serves
     used = jnp.any(scene.counts(view.recipes) > 0, axis=0)
     return [
@@ -416,7 +416,7 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
 
 
 def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Array, ""], action: Int[Array, ""]):
-    """Return the action in a room that both agents share: wait out of the teammate's way, without blocking forever."""
+    """Return the action in a shared room, where the ego waits out of the teammate's way and ends mutual blocking."""
     scene, facts, still = view.scene, view.facts, view.memory.still
     tables = scene.tables
     ahead = jnp.asarray(tables.ahead)[scene.partner, scene.state.facings[TEAMMATE].astype(jnp.int32)]

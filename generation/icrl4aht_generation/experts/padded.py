@@ -75,7 +75,7 @@ def _largest_of(layouts: tuple[Layout, ...]) -> list[Layout]:
 
 
 def largest_layouts(layouts: Sequence[Layout]) -> list[Layout]:
-    """Return layouts that together have the largest size of every axis of the tables and of the oracle's facts."""
+    """Return layouts that together have the largest size of every axis of the tables and of `LayoutFacts`."""
     sizes = np.array([_axis_sizes(layout) for layout in layouts])
     return [layouts[number] for number in dict.fromkeys(sizes.argmax(axis=0).tolist())]
 

@@ -69,7 +69,7 @@ def padded_dishes(layouts: Sequence[Layout]) -> np.ndarray:
 
 
 def with_taken_action(memory: OracleMemory | SearchMemory, action: Int[Array, "*B"]) -> Any:
-    """Return the memory of the oracle or the searcher with the action that was taken instead of its own action."""
+    """Return a memory of the oracle or the searcher in which the taken action replaces the chosen action."""
     if isinstance(memory, SearchMemory):
         return memory._replace(oracle=memory.oracle._replace(action=action))
     return memory._replace(action=action)
@@ -99,9 +99,9 @@ SITUATION_SEARCHER = Policy((), _initial_memory, _act, "situation")
 
 
 def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"]) -> SearchMemory:
-    """Return the memory updated by what happened in the previous step."""
+    """Return the memory updated by the outcome of the previous step."""
     new, old = unpack(view.tables, view.record), unpack(view.tables, memory.oracle.record)
-    # The first step of an episode shows no outcome: random starts are rarely one step from the last positions.
+    # `follows` excludes an episode's first step: random starts are rarely one move from the last positions.
     moves = jnp.asarray(view.tables.moves)[old.positions.astype(jnp.int32)]
     follows = jnp.all(jnp.any(moves == new.positions[:, None], axis=1))
     ahead = jnp.asarray(view.tables.ahead)[old.positions.astype(jnp.int32), old.facings.astype(jnp.int32)]
@@ -112,7 +112,7 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
     # If both agents deliver in one step, the reward does not show whose dish was right.
     paid = memory.paid | (is_dish.any(axis=0) & (new.delivered > 0) & ~gave.all())
     refused = memory.refused | (is_dish[EGO] & (new.delivered == 0))
-    # What the teammate cooks is a hint to the wanted dish, although the teammate may make mistakes.
+    # The ingredients that the teammate cooks hint at the wanted dish, although the teammate may make mistakes.
     had = old.hands[TEAMMATE]
     into_pot = jnp.sum(ingredient_count(new.pot_items)) > jnp.sum(ingredient_count(old.pot_items))
     put = (had >> 2 > 0) & (had & PLATE == 0) & (new.hands[TEAMMATE] == 0) & into_pot

@@ -44,7 +44,7 @@ queue_options = dataclass_options(QueueOptions, "queue")
 
 
 def read_queue_options(queue: dict[str, Any]) -> QueueOptions:
-    """Return a command's options of a queue, and set the environment variables that JAX reads at its first use.
+    """Return the queue options of a command, and set the environment variables that JAX reads at its first use.
 
     Raises:
         click.UsageError: if an option is only valid for another executor.
@@ -53,6 +53,6 @@ def read_queue_options(queue: dict[str, Any]) -> QueueOptions:
     if options.executor == "local" and options.address:
         raise click.UsageError("--address needs --executor ray")
     request_determinism()
-    if options.executor == "ray":  # by default JAX reserves most of a GPU's memory, which other workers need
+    if options.executor == "ray":  # else JAX would reserve most of a GPU's memory, which other workers need
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     return options

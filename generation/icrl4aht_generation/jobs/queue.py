@@ -31,7 +31,7 @@ from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.ray_executor import run_on_ray
 
 _POLL_SECONDS = 1.0
-_QUICK_JOBS = 256  # jobs of one process, which is then replaced to release its memory
+_QUICK_JOBS = 256  # a process is replaced after this number of jobs to release its memory
 
 _Pool = tuple[int | None, ProcessPoolExecutor]
 """Number of XLA threads and a pool of a single process, since a killed worker breaks its whole pool."""

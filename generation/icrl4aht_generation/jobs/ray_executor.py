@@ -20,7 +20,7 @@ from icrl4aht_generation.jobs.options import QueueOptions
 
 _POLL_SECONDS = 1.0
 _CONNECT_SECONDS = 10.0
-_OBJECT_STORE_BYTES = 100 * 2**20  # small, since results go to the disk and not through Ray
+_OBJECT_STORE_BYTES = 100 * 2**20  # a small store is enough, since results go to the disk and not through Ray
 
 
 def run_on_ray(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
@@ -36,7 +36,7 @@ def run_on_ray(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueO
         remote = ray.remote(
             num_cpus=1,
             num_gpus=int(accelerated),
-            max_calls=1,  # every job has a new process, which releases its memory
+            max_calls=1,  # a new process for every job, since its end releases the memory
             max_retries=options.retries,
             retry_exceptions=True,
         )(run_in_worker)
@@ -55,7 +55,7 @@ def run_on_ray(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueO
 def _job_outcome(ray: Any, reference: Any, job: Job, options: QueueOptions) -> JobOutcome:
     try:
         return JobOutcome(job, ray.get(reference))
-    except ray.exceptions.RayError as error:  # raised by the job, or the worker died
+    except ray.exceptions.RayError as error:  # the job raised an error, or the worker died
         cause = getattr(error, "cause", error)
         trace = Text.from_ansi(str(error)).plain
         return JobOutcome(job, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", trace)
@@ -81,7 +81,7 @@ def _connected(options: QueueOptions) -> Iterator[Any]:
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     elif options.workers is not None:
-        raise OptionError(f"workers = {options.workers}: the Ray at {options.address} sets its own number")
+        raise OptionError(f"workers = {options.workers}: the Ray cluster at {options.address} sets the number; omit it")
     try:
         import ray
     except ImportError as error:

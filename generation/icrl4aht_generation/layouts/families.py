@@ -58,7 +58,7 @@ def generate_layouts(family: str, seed: int, count: int, *, split: str | None = 
     if count > MOST_LAYOUTS:
         raise OptionError(f"count = {count}: a family has at most {MOST_LAYOUTS} layouts of one seed; ask for fewer")
     found: list[Layout] = []
-    numbered = islice(_named_layouts(family, seed), MOST_LAYOUTS)  # also limits layouts of other splits
+    numbered = islice(_named_layouts(family, seed), MOST_LAYOUTS)  # the limit counts layouts of all splits
     while len(found) < count:
         layout = next(numbered, None)
         if layout is None:
@@ -76,7 +76,7 @@ def find_generated(name: str) -> Layout:
     """Return the generated layout with a name such as templates-0-17, after generating all layouts before it.
 
     Raises:
-        OptionError: if the name is not family-seed-number, or the family has fewer layouts, at most `MOST_LAYOUTS`.
+        OptionError: if the name is not family-seed-number, or the family has no layout of this number.
         UnknownNameError: if the family does not exist.
     """
     parts = re.fullmatch(r"(\w+)-(\d+)-(\d+)", name, re.ASCII)

@@ -115,7 +115,7 @@ def furnish_rooms(rooms: np.ndarray, rng: np.random.Generator) -> LayoutDraw | N
 
 
 def _draw_fixtures(walls: int, rng: np.random.Generator) -> tuple[list[str], tuple[tuple[int, int, int], ...]]:
-    """Return random letters of fixtures and random recipes: 2 to 4 of two ingredients, or 2 to 10 of three."""
+    """Return letters of random fixtures, and random recipes: 2 to 4 for two ingredients, or 2 to 10 for three."""
     types = sorted(rng.choice(_INGREDIENT_IDS, rng.integers(2, 4), replace=False).tolist())
     dishes = list(combinations_with_replacement(types, 3))
     chosen = rng.choice(len(dishes), rng.integers(2, len(dishes) + 1), replace=False)

@@ -18,7 +18,7 @@ def grid_of(layout: Layout) -> np.ndarray:
 
 
 def rows_of(grid: np.ndarray) -> tuple[str, ...]:
-    """Return the rows of a grid as strings, the form of `Layout.rows`."""
+    """Return the rows of a grid as strings, in the form of `Layout.rows`."""
     return tuple("".join(row) for row in grid.tolist())
 
 

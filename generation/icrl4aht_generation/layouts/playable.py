@@ -1,4 +1,4 @@
-"""Test layouts by play: whether the oracle, alone or with a second oracle, delivers a soup."""
+"""Test layouts by playing episodes: whether the oracle, alone or with a second oracle, delivers a soup."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def layouts_delivered(
         missing = np.flatnonzero(~found)
         for start in range(0, len(missing), _AT_ONCE):
             numbers = missing[start : start + _AT_ONCE]
-            found[numbers] = _delivered(layouts, largest, numbers, tries)
+            found[numbers] = _can_deliver(layouts, largest, numbers, tries)
             checked(int(found[numbers].sum()))
     checked(int((~found).sum()))
     return found
 
 
-def _delivered(
+def _can_deliver(
     layouts: Sequence[Layout],
     largest: list[Layout],
     numbers: np.ndarray,
@@ -61,7 +61,7 @@ def _delivered(
     # All batches share a compilation: the largest layouts give them equal shapes, and short batches repeat layouts.
     own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
-    # Computing the oracles' facts takes longer than an episode, so all tries of a batch share the facts.
+    # Computing `LayoutFacts` takes longer than an episode, so all tries of a batch share the result.
     egos = oracle_params(own), oracle_params([_with_exchanged_agents(layout) for layout in own])
     starts = np.array([layout.agent_cells for layout in own], np.uint8)
     earned = np.zeros(len(own), bool)
@@ -76,7 +76,7 @@ def _delivered(
 
 
 def _players(env: Environment, egos: tuple[Any, Any], playing: Any, count: int) -> list[Player]:
-    """Return a player for each agent of every environment: an oracle, or a player that only stays."""
+    """Return a player for each agent of every environment: an oracle, or a player that never moves (`stay`)."""
 
     def act(agent: int) -> Callable[..., Any]:
         def act_if_playing(params: Any, memory: Any, view: Situation, key: Any) -> Any:
@@ -94,7 +94,7 @@ def _players(env: Environment, egos: tuple[Any, Any], playing: Any, count: int) 
 
 @jax.jit
 def _start_episodes(tables: Tables, egos: tuple[Any, Any], keys: Any, starts: Any, at_starts: Any) -> RolloutCarry:
-    """Return the carry of new episodes, with agents on random cells or on the maps' start cells."""
+    """Return the `RolloutCarry` of new episodes, with agents on random cells or on the maps' start cells."""
     env = Environment(tables)
     carry = init_rollout(env, _players(env, egos, (True, True), len(keys)), keys)
     record = carry.env.record
@@ -111,7 +111,7 @@ def _play(tables: Tables, egos: tuple[Any, Any], playing: Any, carry: RolloutCar
 
 
 def _with_exchanged_agents(layout: Layout) -> Layout:
-    """Return a layout with exchanged agents, for a policy that can only play the ego."""
+    """Return a layout with exchanged start cells of the agents, for a policy that can only play the ego."""
     return _ExchangedLayout(layout.name, layout.alias, layout.rows, layout.recipes, layout.indicates_delivery)
 
 

@@ -21,7 +21,7 @@ _FEWEST_CELLS = 6  # minimum size of a shared room
 
 
 def draw_rooms(seed: int) -> Iterator[LayoutDraw]:
-    """Yield layouts with new rooms, the three kinds in turn; none has the rooms of a published layout."""
+    """Yield layouts with new rooms of the three kinds in turn; the rooms differ from those of all published layouts."""
     rng = np.random.default_rng([seed, *b"rooms"])
     published = published_rooms(tested=False) | published_rooms(tested=True)
     while True:
@@ -65,7 +65,7 @@ def _crop(floor: np.ndarray) -> np.ndarray:
 
 
 def _two_rooms(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return two rooms with a line of counters, perhaps with a step, between them; each may lack a corner."""
+    """Return two rooms, each perhaps without a corner, separated by a line of counters that may have a step."""
     upright = bool(rng.integers(2))
     rows, columns = (MOST_ROWS, MOST_COLUMNS) if upright else (MOST_COLUMNS, MOST_ROWS)
     while True:

@@ -32,7 +32,7 @@ POLICY_CHECKPOINTS = 5
 def checkpoint_updates(config: PPOConfig) -> tuple[int, ...]:
     """Return the numbers of updates after which a checkpoint is saved, ascending; the last is the end of training.
 
-    A training with fewer updates than `POLICY_CHECKPOINTS` has a checkpoint after each update.
+    A training run with fewer updates than `POLICY_CHECKPOINTS` has a checkpoint after each update.
     """
     moments = (-(-config.updates * (number + 1) // POLICY_CHECKPOINTS) for number in range(POLICY_CHECKPOINTS))
     return tuple(dict.fromkeys(moments))
@@ -92,7 +92,7 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
 
 
 def _without_zero_rows(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the weights to store: of a matrix with mostly zero rows, only the nonzero rows and their indices.
+    """Return the weights to store, where a matrix of mostly zero rows is reduced to its nonzero rows and their indices.
 
     This shortens the kernel of encoder `mlp`, because most entries of the flat window are always 0 on a layout.
     """

@@ -111,5 +111,5 @@ class PPOConfig:
 
     @property
     def episodes(self) -> int:
-        """Number of episodes of each environment whose stored steps, and the next state, are within the updates."""
+        """Number of episodes per environment that the updates cover up to the state after the last stored step."""
         return max(0, (self.updates * self.rollout - KEPT_STEPS - 1) // EPISODE_STEPS + 1)

@@ -264,7 +264,7 @@ class FlatDense(nn.Module):
         return x.astype(self.dtype) @ kernel + bias
 
     def _initial_kernel(self, key: Array, shape: tuple[int, int]) -> Array:
-        kernel = nn.initializers.orthogonal(2**0.5)(key, shape)  # scaled before any rows become zero
+        kernel = nn.initializers.orthogonal(2**0.5)(key, shape)  # scale the kernel before any rows become zero
         if self.view is None:
             return kernel
         varies = np.zeros((shape[0], 1), bool)

@@ -20,7 +20,7 @@ from icrl4aht_generation.learners.encoder import CompactView, Seen, WindowEncode
 
 
 class GRU(nn.Module):
-    """A GRU over time that starts from zero where `reset` is set. Parameters as in `flax.linen.GRUCell`."""
+    """A GRU over time that starts from zero where `reset` is set, with the parameters of `flax.linen.GRUCell`."""
 
     width: int
 

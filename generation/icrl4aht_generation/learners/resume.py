@@ -1,7 +1,7 @@
-"""Save and resume a training: the saved state, the log, the lock of the folder, and the interval of saves.
+"""Save and resume a training run: the saved state, the log, the lock of the folder, and the interval of saves.
 
-Every training of this project (egos, populations, in-context learners) depends only on its settings and its state after
-the last update. A resumed training gives identical results with three parts of this module: `StateFile` restores the
+Every training run of this project (egos, populations, in-context learners) depends only on its settings and its state
+after the last update. Three parts of this module make the results of a resumed run identical: `StateFile` restores the
 exact state and refuses states of other settings, `RunLog` removes log lines written after the state was saved, and
 `run_lock` keeps other processes out of the folder.
 """
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from filelock import Timeout
 from flax.traverse_util import flatten_dict
-from jax._src.xla_bridge import backends_are_initialized  # no public function tells this without initializing
+from jax._src.xla_bridge import backends_are_initialized  # JAX has no public function for this
 from jax.experimental import multihost_utils
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as to_bytes
@@ -75,7 +75,7 @@ def limit_xla_threads(threads: int) -> None:
 
 
 def software_versions() -> dict[str, str | int | None]:
-    """Return versions and number of threads that must stay equal for a resumed training to give identical results."""
+    """Return the software versions and the number of threads, on which the exact results of a training run depend."""
     return {
         "jax": jax.__version__,
         "platform": jax.default_backend(),
@@ -100,7 +100,7 @@ def differing_settings(found: Mapping[str, Any], expected: Mapping[str, Any]) ->
 
 @contextmanager
 def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Context manager that holds the lock of a training's folder.
+    """Context manager that holds the lock of a training run's folder.
 
     Args:
         folder: the folder, which need not exist; its parent is created.
@@ -145,7 +145,7 @@ class SaveInterval:
 
 
 class StateFile:
-    """A safetensors file with the state of a training, the training's settings, and its progress.
+    """A safetensors file with the state, the settings and the progress of a training run.
 
     Arrays are named by their path in the state's pytree ("params/actor/kernel"); typed keys (of JAX's default kind) are
     stored as their data. Metadata: `format`, `settings` (JSON), `progress` (number of updates). The file
@@ -182,8 +182,8 @@ class StateFile:
         for name, (found, expected) in different.items():
             resume = f"set {_XLA_THREADS[0]}={found} to resume it, " if name == "xla_threads" and found else ""
             raise OtherSettingsError(
-                f"{self.path}: saved by a training with other settings: {name} was {found!r}, now it is {expected!r}; "
-                f"{resume}remove the file to start again, or choose another folder"
+                f"{self.path}: saved by a training run with other settings: {name} was {found!r}, now it is "
+                f"{expected!r}; {resume}remove the file to start again, or choose another folder"
             )
         return progress
 
@@ -195,7 +195,7 @@ class StateFile:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(self.path) as partial:
                 partial.write_bytes(_file_bytes(arrays, metadata))
-        if jax.process_count() > 1:  # no process continues before the file is complete
+        if jax.process_count() > 1:  # all processes wait until the file is complete
             multihost_utils.sync_global_devices(f"saved {self.path.name}")
 
     def load(self, like: Any, part: str = "") -> Any:
@@ -235,11 +235,11 @@ class StateFile:
 
 
 class Checkpoints:
-    """The latest states of a training, each in a `StateFile` FOLDER/<step>.safetensors.
+    """The latest states of a training run, each in a `StateFile` FOLDER/<step>.safetensors.
 
     Args:
         folder: folder of the files, which need not exist.
-        settings: settings of the training, see `StateFile`.
+        settings: settings of the training run, see `StateFile`.
         keep: number of states to keep; older files are removed.
     """
 
@@ -253,7 +253,7 @@ class Checkpoints:
 
     @property
     def latest(self) -> int | None:
-        """Step of the last checkpoint; None without a checkpoint."""
+        """Step of the last checkpoint; None if no checkpoint exists."""
         return max(self.steps, default=None)
 
     def at(self, step: int) -> StateFile:
@@ -271,7 +271,7 @@ class Checkpoints:
         """Return the state of the last checkpoint, or a part of the state, and the step; see `StateFile.load`.
 
         Raises:
-            OptionError: if no checkpoint exists, or if `StateFile.load` raises the error.
+            OptionError: if no checkpoint exists, or `StateFile.load` raises this error.
         """
         step = self.latest
         if step is None:
@@ -280,7 +280,7 @@ class Checkpoints:
 
 
 class RunLog:
-    """The log of a training: FOLDER/metrics.jsonl and FOLDER/timing.jsonl, JSON lines in the order of the updates.
+    """The log of a training run: FOLDER/metrics.jsonl and FOLDER/timing.jsonl, JSON lines in the order of the updates.
 
     The timing has a separate file, because unlike the metrics it differs between equal runs. Opening the log cuts both
     files at the first line that `keep` rejects or that is incomplete, since a killed run may have written lines after
@@ -322,7 +322,7 @@ class RunLog:
 def _truncate_log(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
     lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
     kept: list[bytes] = []
-    with suppress(ValueError):  # an incomplete line of a killed run
+    with suppress(ValueError):  # incomplete line, left by a killed run
         for line in lines:
             if not (line.endswith(b"\n") and keep(json.loads(line))):
                 break

@@ -167,7 +167,7 @@ def network_player(
     partner: Any,
     greedy: bool | Array = False,
 ) -> Player:
-    """Return a player that acts by one or several policies of the same network.
+    """Return a player that follows one policy, or several policies with the same network.
 
     Args:
         env: the environment.
@@ -227,16 +227,16 @@ def policy_player(
     """
     axis, played = 0 if own_params else None, np.arange(envs) if only is None else only
 
-    def own_states(state: EnvState) -> EnvState:
+    def selected_states(state: EnvState) -> EnvState:
         return state if only is None else jax.tree.map(lambda leaf: leaf[only], state)
 
     def init(state: EnvState) -> Any:
-        keys = jax.vmap(jax.random.fold_in)(env.episode_key(own_states(state)), jnp.full(len(played), agent))
+        keys = jax.vmap(jax.random.fold_in)(env.episode_key(selected_states(state)), jnp.full(len(played), agent))
         return jax.vmap(policy.init, in_axes=(axis, 0))(params, keys)
 
     def act(memory, state: EnvState, key):
         keys = jax.random.split(key, len(played))
-        action, memory = env.act(policy, params, memory, own_states(state), agent, keys, own=own_params)
+        action, memory = env.act(policy, params, memory, selected_states(state), agent, keys, own=own_params)
         return Choice(action, jnp.zeros(len(played)), jnp.zeros(len(played))), memory
 
     return Player(agent * envs + played, init, act)

@@ -151,7 +151,7 @@ def cost_rows(cost: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def step_seconds(config: PPOConfig) -> float:
-    """Return the seconds per environment step of a learner: acting, the environment, and learning in all epochs."""
+    """Return the seconds per environment step of a learner for acting, the environment, and all epochs of learning."""
     passes = 1 + _GRADIENT * config.epochs
     # One layout is enough: layouts differ in the number of channels, which only affects the network's first layer.
     return passes * forward_seconds(get_layout("demo_wide"), config) + 1 / ENVIRONMENT_STEPS_PER_SECOND
@@ -165,7 +165,7 @@ def forward_seconds(layout: Layout, config: PPOConfig) -> float:
     network = ActorCritic(config.widths, view=view)
     shapes = jax.eval_shape(lambda key: network.untrained(key, layout.channels), jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    # All environments have equal records, because most observations in training are equal, which `words` exploits.
+    # All environments have equal records, because most observations in training are equal, which the encoder exploits.
     record = np.random.default_rng(0).integers(0, 256, (steps, 1, record_size(layout)), np.uint8)
     records = jnp.asarray(np.repeat(record, count, axis=1))
     reset = jnp.zeros((steps, count), bool)
@@ -177,7 +177,7 @@ def forward_seconds(layout: Layout, config: PPOConfig) -> float:
     def call() -> None:
         jax.block_until_ready(forward(params, records))
 
-    call()  # compiles
+    call()  # the first call compiles
     # Take the fastest of a few calls, because other programs may slow down some calls.
     return min(repeat(call, number=1, repeat=3)) / (steps * count)
 

@@ -140,8 +140,8 @@ def report_diversity(
     ]
     if not names:
         raise OptionError(
-            f"{suite}: no layout has all its populations finished; `icrl4aht-data teammates --suite {suite}` "
-            f"trains populations, or choose a --layout"
+            f"{suite}: no layout has all its populations finished; train populations with "
+            f"`icrl4aht-data teammates --suite {suite}`, or choose a --layout"
         )
     for name in names:
         layout = get_layout(name)
@@ -179,7 +179,7 @@ def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], co
 
 
 def _matrix_text(names: list[str], values: np.ndarray) -> str:
-    """Return a square matrix as text, with equal names of rows and columns."""
+    """Return a square matrix as text, with the same names for rows and columns."""
     return pd.DataFrame(values, names, names).to_string(float_format="{:.2f}".format)
 
 

@@ -43,10 +43,10 @@ class TeammateSelection:
 def select_teammates(
     suite: Path, layout: str, algorithm: str, train: int, heldout: int, seed: int = 0
 ) -> TeammateSelection:
-    """Select random teammates from the checkpoints with a return, as teammates, above the threshold.
+    """Select random teammates from the checkpoints whose return as a teammate is above the threshold.
 
     The members of the population take turns, because checkpoints of one member are similar. If the checkpoints are too
-    few for both splits, at most a fifth of them is held out.
+    few for both splits, at most a fifth of the checkpoints is held out.
 
     Args:
         suite: the suite's folder.

@@ -113,7 +113,7 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
         profile = _build_profile(path.stem, msgspec.convert(_read_content(path), _ProfileFile))
     prepare(profile)
     with _errors_with_path(path):
-        units = profile.units()  # raises for unknown presets and for too many sampled teammates
+        units = profile.units()  # raises an error for unknown presets or too many sampled teammates
         if not units and not profile.algorithms:
             raise OptionError(
                 "no tasks: expected teammates in tasks.presets, tasks.sampled, tasks.spread or tasks.algorithms"
@@ -159,13 +159,13 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
     layouts += tuple(generated)
     _check_known("source", "tasks.sources", sources, REBUILT_SOURCES)
     if not layouts and sources != ("search",):
-        raise OptionError("tasks.layouts: no layouts; name layouts in tasks.layouts or add tasks.generated")
+        raise OptionError("tasks.layouts: expected layouts, found none; name layouts, or add tasks.generated")
     preference = PREFERENCE_LAYOUTS["train"] if tasks.preference == ("all",) else tasks.preference
     _check_known("layout of the track preference", "tasks.preference", preference, PREFERENCE_LAYOUTS["train"])
     if bool(preference) != ("search" in sources):
         raise OptionError(
-            f"tasks.preference = {list(tasks.preference)}, tasks.sources = {list(sources)}: expected layouts of the "
-            f"track preference with the source search, and no such layouts without this source"
+            f"tasks.preference = {list(tasks.preference)}, tasks.sources = {list(sources)}: expected layouts in "
+            f"tasks.preference if tasks.sources contains search, and none otherwise"
         )
     if "ppo" not in sources:
         release.keep = 0
@@ -272,7 +272,7 @@ def _teammates(values: dict[str, Any]) -> TeammateConfig:
 
 
 def _by_layout(key: str, value: Mapping[str, Value] | Value, layouts: tuple[str, ...]) -> dict[str, Value]:
-    """Return a value for each layout, from one value for all layouts or from a table of some layouts."""
+    """Return a value for each layout, from one value for all layouts or from a table of values by layout."""
     if not isinstance(value, Mapping):
         return dict.fromkeys(layouts, value)
     found = dict(zip(_layout_names(key, list(value)), value.values(), strict=True))
@@ -284,7 +284,7 @@ def _by_layout(key: str, value: Mapping[str, Value] | Value, layouts: tuple[str,
 
 def _check_distinct(key: str, names: Sequence[str]) -> tuple[str, ...]:
     if len(set(names)) < len(names):
-        raise OptionError(f"{key} = {names!r}: expected different names")
+        raise OptionError(f"{key} = {names!r}: expected every name only once")
     return tuple(names)
 
 

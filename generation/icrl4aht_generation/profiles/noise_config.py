@@ -1,4 +1,4 @@
-"""Options of histories of the sources `noise` and `search`: their number, length and noise schedules."""
+"""Options of the sources `noise` and `search`: number and length of the histories, and noise schedules."""
 
 from __future__ import annotations
 

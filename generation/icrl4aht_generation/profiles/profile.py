@@ -105,7 +105,7 @@ class SpreadConfig:
         """Return the teammates of a source on a layout, and the splits of their tasks.
 
         Raises:
-            OptionError: if fewer measured teammates differ from the test teammates.
+            OptionError: if too few measured teammates of the layout differ from the test teammates.
         """
         count = self.ppo[layout] if source == "ppo" else None
         found = [("train", entry) for entry in self._entries(layout, "train", self.per_layout[layout])[:count]]
@@ -121,7 +121,7 @@ class SampledConfig(SpreadConfig):
     """Numbers of heuristic teammates sampled from the published training ranges, see `teammates.draws`.
 
     Attributes:
-        families: heuristic families by layout, which take turns.
+        families: heuristic families by layout, from which teammates are chosen in turn.
     """
 
     families: dict[str, tuple[str, ...]]
@@ -325,7 +325,7 @@ def _sampled_seed(layout: str, source: str, entry: Mapping[str, Any]) -> int:
 
 
 def _task_of_source(task: Task, source: str) -> Task:
-    """Return a task, with a preset or a learned teammate, with the seed of its source; "ppo" keeps the task's seed."""
+    """Return a task of a preset or learned teammate with a seed for its source; for "ppo" the seed does not change."""
     if source == "ppo":
         return task
     seed = _first_seed(source) + _UNSAMPLED_SEEDS + task.seed

@@ -66,11 +66,11 @@ def build_releases(
         OptionError: if `out` has files that this function does not write, if out/<kind> is not a release of this
             profile, or if matplotlib is not installed.
     """
-    check_can_draw()  # fail before the long training and not at its end
+    check_can_draw()  # raise this error before the long training, not after it
     for kind in kinds:
         check_release_folder(out / kind, profile)
     options = options or QueueOptions()
-    out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
+    out, suite = out.resolve(), (suite or out / SUITE).resolve()  # absolute, as workers have other working directories
     names = {"artefacts", SUITE, FAILED, f".{FAILED}.lock", _PACKING_LOCK, *KINDS, *(f".{kind}.old" for kind in KINDS)}
     check_folder_content(out, names | ({suite.name} if suite.parent == out else set()), "a rebuild")
     if tasks is None:

@@ -1,7 +1,7 @@
 """Choose the ego checkpoint that labels a task's histories, by returns with the task's teammate.
 
 The labeller is the last checkpoint, as in the paper, unless an earlier checkpoint earns clearly more with greedy
-actions, which labels are. A policy that was trained with random actions can get stuck in "stay" when it acts greedily,
+actions, as in the labels. A policy that was trained with random actions can get stuck in "stay" when it acts greedily,
 and a model would learn this from the labels. If a task has several independent learners, the learner with the best
 labeller labels the histories of all learners.
 """
@@ -104,7 +104,7 @@ def learner_labeller(folder: Path, task: Task, suite: Path) -> tuple[Path, Exper
         return_sampled=float(sampled[chosen]),
         episodes=LABEL_EPISODES,
         last_return_greedy=float(greedy[-1]),
-        view="ego",  # the network of a learner takes observations
+        view="ego",  # a learner's network only receives observations
     )
 
 

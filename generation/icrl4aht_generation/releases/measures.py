@@ -1,7 +1,7 @@
-"""Facts about the teammates of a release: returns of reference egos with each teammate, and the nearest test teammate.
+"""Measurements of a release's teammates: returns of reference egos with each teammate, and the nearest test teammate.
 
-Facts about sampled teammates are in `teammates/draws.jsonl`; facts about teammates of an existing release are in its
-provenance. Other teammates are measured once, and the measurements are stored next to the artefacts, in hidden files
+Measurements of sampled teammates are in `teammates/draws.jsonl`; those of an existing release's teammates are in its
+provenance. Other teammates are measured once, and these measurements are stored next to the artefacts, in hidden files
 `.<layout>.teammates.json`.
 """
 
@@ -96,7 +96,7 @@ def _compiled_self_play(layout: Layout, ego: Policy, mate: Policy) -> Callable[[
 
 
 class TeammateFacts(NamedTuple):
-    """Facts about the teammate of a task.
+    """Measurements of the teammate of a task.
 
     Attributes:
         references: returns of the reference egos with the teammate.
@@ -115,17 +115,17 @@ class TeammateFacts(NamedTuple):
 def teammate_facts(
     tasks: Iterable[Task], artefacts: Path, suite: Path, headroom: Mapping[str, ReferenceEgos] | None = None
 ) -> dict[str, TeammateFacts]:
-    """Return recorded or measured facts about the teammates of tasks; each teammate is measured only once.
+    """Return the recorded or new measurements of the teammates of tasks; each teammate is measured only once.
 
     Args:
         tasks: tasks with the teammates.
         artefacts: folder of the artefacts, where measurements are stored.
-        suite: folder of the learned teammates: a suite, or the folder `teammates` of a release with recorded facts in
-            its provenance.
+        suite: folder of the learned teammates: a suite, or the folder `teammates` of a release with measurements
+            in its provenance.
         headroom: existing measurements of learned teammates by task id.
 
     Returns:
-        Facts about each task's teammate by task id.
+        Measurements of each task's teammate by task id.
     """
     headroom, recorded = headroom or {}, recorded_provenance(suite)
     groups = grouped(tasks, lambda task: task.teammate_key)
@@ -167,7 +167,7 @@ def cached_measurement(path: Path, settings: dict[str, Any], kind: type[T], meas
         if content["settings"] == json.loads(json.dumps(settings)):
             return msgspec.convert(content["measured"], kind)
     except (IndexFormatError, KeyError, TypeError, msgspec.MsgspecError):
-        pass  # a file that is missing, damaged or from another version
+        pass  # the file is missing, damaged or from another version
     measured = measure()
     with atomic_write(path) as partial:
         partial.write_bytes(msgspec.json.encode({"settings": settings, "measured": measured}))

@@ -259,7 +259,7 @@ def _new_task(
         expert=expert,
         **own,
     )
-    # The oracle's actions are stored where they are worth learning, or are the labels anyway.
+    # Store the oracle's actions if they are worth learning, or if the oracle also gives the labels.
     with_oracle = profile.oracle_actions and made.is_oracle_useful(float(curve_ends(found.kept)[1].mean()))
 
     def load() -> Iterator[NewHistory]:

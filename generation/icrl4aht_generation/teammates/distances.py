@@ -129,7 +129,7 @@ def instance_policies(layout: Layout) -> list[Policy]:
 
 
 def instance_entries(layout: Layout) -> list[dict[str, Any]]:
-    """Return the test instances that models trained on a layout are tested with, by family and number."""
+    """Return the test instances that test models trained on a layout, by family and number."""
     tested = TESTED_ON.get(layout.name, layout.name)
     return [entry for family in TESTED_FAMILIES for entry in published_teammates(tested, family)]
 
@@ -177,7 +177,7 @@ def _compiled_test_play(families: tuple[Policy, ...], episodes: int) -> Callable
 
 
 def act_on_records(layout: Layout, policies: Sequence[Policy], records: Array, seed: int = _SEED) -> np.ndarray:
-    """Return the actions of policies as the teammate on recorded episodes, with memories of the observed episodes.
+    """Return the actions that policies would choose as the teammate in each step of recorded episodes.
 
     Args:
         layout: layout of the episodes.
@@ -221,7 +221,7 @@ def _compiled_situation_actions(family: Policy) -> Callable[..., Array]:
 def _actions(family: Policy, see: Callable[[Array], Any], params: Any, records: Array, keys: Array) -> Array:
     """Return actions on records, int8 (policies, T, episodes); `see` converts a record to the policies' view."""
 
-    def one(params: Any) -> Array:
+    def policy_actions(params: Any) -> Array:
         def step(memories: Any, record: Array) -> tuple[Any, Array]:
             def act(memory: Any, single: Array, key: Array) -> Any:
                 return family.act(params, memory, see(single), key)
@@ -232,7 +232,7 @@ def _actions(family: Policy, see: Callable[[Array], Any], params: Any, records: 
         memories = jax.vmap(family.init, in_axes=(None, 0))(params, keys)
         return jax.lax.scan(step, memories, records)[1]
 
-    return jax.lax.map(one, params)  # one policy at a time, which bounds the memory
+    return jax.lax.map(policy_actions, params)  # one policy at a time, which bounds the memory
 
 
 def distances_to_tests(tested: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -291,7 +291,7 @@ def fill_table(
         on_layout(number, name)
         own = [row for row in rows if row.layout == name]
         complete = len(own) == len(DRAW_NUMBERS)
-        if spread:  # a list from other candidates is outdated
+        if spread:  # a list that was chosen from other candidates is outdated
             complete = [row.tried for row in own] == [len(candidates)]
         if overwrite or not complete:
             layout = get_layout(name)
@@ -363,7 +363,7 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]]) -> Layo
     policies = [build_teammate(None, entry) for entry in with_equal_parameters([*tested, *candidates])]
     actions, policies = act_on_records(layout, policies, records), policies[len(tested) :]
     tests, actions = distances_to_tests(actions[: len(tested)], actions[len(tested) :]), actions[len(tested) :]
-    returns = reference_returns(layout, policies)  # of all candidates, so layouts share one compilation
+    returns = reference_returns(layout, policies)  # all candidates play, so layouts share one compilation
     unlike = tests.min(axis=1) >= DIVERSE_DISTANCE
     headroom = unlike & (np.ptp(returns, axis=1) >= LEAST_HEADROOM)
     usable = np.flatnonzero(headroom if headroom.any() else unlike)

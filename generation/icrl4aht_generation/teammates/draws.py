@@ -41,7 +41,7 @@ _VALIDATION_SEED, _VALIDATION_TEAMMATES = 1, 4
 
 _DIVERSE_SEEDS = {"train": 2, "validation": 3}
 
-_DIVERSE_TEAMMATES = {"train": 12, "validation": 3}  # maximum for each layout and family
+_DIVERSE_TEAMMATES = {"train": 12, "validation": 3}  # maximum number of tasks of a family on a layout
 
 DIVERSE_DISTANCE = 0.1
 """Minimum Hamming distance of a diverse teammate to the test instances of all families."""

@@ -40,7 +40,7 @@ _TEST_TASKS = {"train": 5, "test": 10}
 
 
 def all_dishes(layout: Layout) -> list[Dish]:
-    """Return all dishes of a layout's ingredients: 4 dishes of two ingredients, 10 of three."""
+    """Return all dishes of a layout's ingredients: 4 dishes for two ingredients, or 10 dishes for three."""
     return list(combinations_with_replacement(layout.ingredients, 3))  # type: ignore[arg-type]
 
 
@@ -68,7 +68,7 @@ def _dishes_and_teammates(layout: Layout, split: str, number: int, part: str) ->
         yield from ((dish, mates[(3 * k + number) % len(mates)]) for k, dish in enumerate(dishes * 4))
         return
     for k in range(_TEST_TASKS[part] if split == "test" else len(TESTED_FAMILIES)):
-        # Different factors give every dish teammates of several families over all layouts.
+        # The two factors differ, so over all layouts every dish occurs with teammates of several families.
         yield dishes[(3 * k + 7 * number) % len(dishes)], mates[(6 * k + number) % len(mates)]
 
 

@@ -74,7 +74,7 @@ def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) 
     key, own = jax.random.split(jax.random.key(int(digest[:8], 16)))
     theta = heuristic.defaults | heuristic.presets[presets[_randint(own, len(presets))]]
     for name, value in theta.items():
-        key, own = jax.random.split(key)  # also for fixed parameters, so each draw is independent of other ranges
+        key, own = jax.random.split(key)  # fixed parameters also use a key, so each draw is independent of other ranges
         if isinstance(ranges.get(name), list):
             theta[name] = ranges[name][_randint(own, len(ranges[name]))]
         elif name in ranges:
@@ -122,7 +122,7 @@ def build_teammate(
         OptionError: if a checkpoint is missing or does not match the layout.
     """
     if slot not in (EGO, TEAMMATE):
-        raise TaskFormatError(f"teammate {teammate['family']}: slot {slot!r}, expected {EGO} or {TEAMMATE}")
+        raise TaskFormatError(f"teammate {teammate['family']}: expected slot {EGO} or {TEAMMATE}, found {slot!r}")
     if teammate.get("kind") == "rl":
         if layout is None:
             raise OptionError(f"teammate {teammate['theta']['checkpoint']}: a checkpoint needs `layout`, found None")
@@ -149,8 +149,8 @@ def recover_teammate(dataset: Dataset, history_id: int, episode: int = 0) -> Pol
     entry = dataset.recover_teammate(history_id, episode)
     if entry["kind"] == "rl" and not dataset.origin.below(f"{TEAMMATES}/{entry['theta']['sha256']}").is_dir():
         raise OptionError(
-            f"{dataset.root / TEAMMATES}: checkpoint {entry['theta']['sha256']} is missing, which is the teammate of "
-            f"history {history_id}; copy the checkpoint from the release from which this release was made"
+            f"{dataset.root / TEAMMATES}: no checkpoint {entry['theta']['sha256']}, the teammate of history "
+            f"{history_id}; copy the checkpoint from the release that this release was made from"
         )
     layout = get_layout(dataset.index.entry(history_id).layout)
     slot, noise = entry.get("slot", TEAMMATE), entry.get("noise", "seeded")

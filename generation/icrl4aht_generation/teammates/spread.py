@@ -49,7 +49,7 @@ _MIXED_DRAWS = 8
 _CHANCES = (0.25, 0.5, 0.75)
 """Chances of a random action, which mixtures use in turn."""
 
-_FIRST_DRAW, _FIRST_MIXTURE = 100, 200  # first numbers of candidates, after presets and specialists
+_FIRST_DRAW, _FIRST_MIXTURE = 100, 200  # first numbers of sampled and of mixed candidates
 
 MOST_CHOSEN = 45
 """Maximum number of chosen teammates on a layout."""
@@ -59,34 +59,34 @@ VALIDATES = 5
 
 _SPECIALISTS: dict[str, tuple[dict[str, float], ...]] = {
     "recipe_aware_button": (
-        {"task_specialization": 1.0},  # only plates and delivers
-        {"wrong_ingredient_prob": 1.0},  # fetches wrong ingredients
-        {"path_blocking": 1.0},  # blocks pots and goals
-        {"plate_timing": 1.0},  # fetches a plate early
+        {"task_specialization": 1.0},  # the teammate only plates and delivers
+        {"wrong_ingredient_prob": 1.0},  # the teammate fetches wrong ingredients
+        {"path_blocking": 1.0},  # the teammate blocks pots and goals
+        {"plate_timing": 1.0},  # the teammate fetches a plate early
         {"idle_prob": 0.5},
     ),
     "territory": (
-        {"behavior_mode": LAZY, "action_probability": 0.0},  # never acts
+        {"behavior_mode": LAZY, "action_probability": 0.0},  # the teammate never acts
         {"behavior_mode": LAZY, "action_probability": 0.5},
         {"behavior_mode": BLOCKER},
-        {"behavior_mode": HOARDER},  # carries everything to counters
+        {"behavior_mode": HOARDER},  # the teammate carries everything to counters
         {"behavior_mode": HOARDER, "split_mode": HORIZONTAL, "strictness": 1.0, "shared_margin": 0},
-        {"behavior_mode": COUNTER},  # puts dishes on counters
+        {"behavior_mode": COUNTER},  # the teammate puts dishes on counters
         {"behavior_mode": COUNTER, "split_mode": HORIZONTAL, "strictness": 1.0, "shared_margin": 0},
         {"behavior_mode": INVADER, "strictness": 1.0, "shared_margin": 0},
         {"behavior_mode": INVADER, "split_mode": STATIONS, "strictness": 1.0, "shared_margin": 0},
     ),
     "assembly_line": (
-        {"role_mode": RUNNER, "handoff_style": 1},  # only fetches, hands over at the middle counters
-        {"role_mode": RUNNER, "handoff_style": 2},  # only fetches, hands over near its partner
+        {"role_mode": RUNNER, "handoff_style": 1},  # the teammate only fetches, and hands over at the middle counters
+        {"role_mode": RUNNER, "handoff_style": 2},  # the teammate only fetches, and hands over near its partner
         {"role_mode": PLATER, "task_abandon_prob": 0.5},
-        {"task_abandon_prob": 1.0},  # puts down whatever it fetches
+        {"task_abandon_prob": 1.0},  # the teammate puts down whatever it fetches
         {"wrong_action_prob": 1.0},
         {"stubbornness": 1.0},
         {"timing_mismatch": 1.0},
     ),
     "utility_greedy": (
-        {"w_press_L": 20.0},  # presses the button whenever possible
+        {"w_press_L": 20.0},  # the teammate presses the button whenever possible
         {"w_fetch_ingredient": 0.0, "w_get_plate": 20.0},
         {"w_fetch_ingredient": 20.0, "w_get_plate": 0.0},
         {"w_stage_on_counter": 20.0, "counter_preference": 1.0},
@@ -172,7 +172,7 @@ def read_spread(layout: str) -> LayoutSpread:
     name = get_layout(layout).name
     check_choice("training layout", name, TESTED_ON)
     if name not in _bundled_spreads():
-        raise OptionError(f"{SPREAD_TABLE}: no line for {name}: `icrl4aht-data research draws --spread` measures it")
+        raise OptionError(f"{SPREAD_TABLE}: no line for {name}; run `icrl4aht-data research draws --spread`")
     return _bundled_spreads()[name]
 
 
@@ -186,7 +186,7 @@ def spread_teammates(layout: str, split: str, count: int) -> list[dict[str, Any]
 
     Raises:
         UnknownNameError: if the layout has no training tasks.
-        OptionError: if the layout was not measured, or has fewer teammates.
+        OptionError: if the layout was not measured, or has fewer chosen teammates of the split.
     """
     if count == 0:
         return []
@@ -202,7 +202,7 @@ def spread_teammates(layout: str, split: str, count: int) -> list[dict[str, Any]
 
 
 def find_measured(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
-    """Return the measurements of a teammate entry from either table, or None if it was not measured.
+    """Return the measurements of a teammate entry from the tables of draws and spreads; None if it was not measured.
 
     The behaviour of a spread teammate is its number in the layout's list.
     """

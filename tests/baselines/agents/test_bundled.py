@@ -89,7 +89,7 @@ def test_bundling_rejects_invalid_names_and_unfinished_runs(run, tmp_path):
     half = tmp_path / "half"
     shutil.copytree(run, half)
     (half / "config.json").write_text(json.dumps(config | {"train": config["train"] | {"steps": 9}}))
-    with pytest.raises(OptionError, match="half: at step 1 of 9: continue the training with the same command"):
+    with pytest.raises(OptionError, match="half: stopped at step 1 of 9; resume training with the same command"):
         bundle_run(half, "ad-tiny", "teammate", tmp_path / "models")
     assert not (tmp_path / "models").exists()
 
@@ -122,7 +122,7 @@ def test_training_rejects_initial_parameters_of_another_model_size(run, tmp_path
     out = str(tmp_path / "out")
     arguments = ["train", "ad", "--layout", "demo_wide", "--channels", "canonical", "--out", out, "--init", str(run)]
     small = ["--steps", "1", "--batch-size", "2", "--context", "6", "--heads", "2", "--dropout", "0.1"]
-    with pytest.raises(OptionError, match=r"run: its parameters are of another model \(width = 8, not 12\): give its"):
+    with pytest.raises(OptionError, match=r"its parameters are of another model \(width = 8, not 12\); give these"):
         run_cli(*arguments, *small, "--layers", "1", "--width", "12", "--positions", "none")
     assert not Path(out).exists()
 

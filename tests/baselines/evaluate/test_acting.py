@@ -85,7 +85,7 @@ class TestBadRuns:
 
 @pytest.mark.slow
 def test_train_command_records_settings_and_data(lite, tmp_path, monkeypatch):
-    """The release is read from an HTTP address."""
+    """The release with the training data is read over HTTP."""
     monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 16, 5, heads=2, encoder="words"))
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     small = ["--steps", "1", "--batch-size", "2", "--context", "4"]

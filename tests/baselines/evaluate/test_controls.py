@@ -1,4 +1,4 @@
-"""Memory and partner controls and the protocol `swap`, tested with an ego that acts by its memory."""
+"""Memory and partner controls and the protocol `swap`, tested with an ego whose actions depend on its memory."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ FOUR = dataclasses.replace(PROTOCOLS["seeded"], episodes=4)
 STAYS, RANDOM, PAID = 0, 1, 2
 
 
-class Remembered(NamedTuple):
-    """Number of finished episodes, reward in the first episode, and whether the ego acts randomly in this episode."""
+class EgoMemory(NamedTuple):
+    """Memory of the ego: finished episodes, reward in the first episode, and whether the ego acts randomly now."""
 
     episodes: jax.Array
     paid: jax.Array
@@ -43,18 +43,18 @@ class Remembered(NamedTuple):
 
 
 def _begin(mode, key):
-    return Remembered(jnp.int32(0), jnp.float32(0), mode == RANDOM)
+    return EgoMemory(jnp.int32(0), jnp.float32(0), mode == RANDOM)
 
 
 def _act(mode, memory, ego_input, key):
     paid = memory.paid + jnp.where(memory.episodes == 0, ego_input.prev_reward, 0)
     wanders = jnp.where(ego_input.prev_done & (mode == PAID), paid <= 0, memory.wanders)
-    memory = Remembered(memory.episodes + ego_input.prev_done, paid, wanders)
+    memory = EgoMemory(memory.episodes + ego_input.prev_done, paid, wanders)
     return jnp.where(wanders, jax.random.randint(key, (), 0, 6), STAY), memory
 
 
 def ego(mode):
-    """Return an ego that stays, acts randomly, or (PAID) acts randomly only after a first episode without reward."""
+    """Return an ego that stays, acts randomly, or (PAID) does so only after a first episode without reward."""
     policy = Policy(jnp.int32(mode), _begin, _act, "ego_input")
     return lambda layout: policy
 
@@ -67,7 +67,7 @@ def programs():
 
 @pytest.fixture(scope="module")
 def solo_returns(programs):
-    """Returns (tasks, episodes) of the ego that stays and of the ego that acts randomly."""
+    """Arrays of returns (tasks, episodes) of the ego that stays and of the ego that acts randomly."""
 
     def play(mode):
         results = evaluate("fixed", ego(mode), TASKS, FOUR, programs=programs)
@@ -81,11 +81,11 @@ def test_memory_and_partner_controls_equal_hand_computed_differences(solo_return
     assert stays.tolist() == [[0] * 4, [40] * 4]
     assert (wanders < stays)[:, 1:].any(axis=1).all()
     found = evaluate_controls("mine", ego(PAID), TASKS, FOUR, out=tmp_path, programs=programs)
-    assert len(programs) == 2  # one program for each teammate family
+    assert len(programs) == 2  # evaluation compiles one program for each teammate family
     plain = np.array([[stays[0, 0], *wanders[0, 1:]], stays[1]])
     np.testing.assert_array_equal([result.returns[0] for result in found.plain], plain)
     np.testing.assert_array_equal([result.returns[0] for result in found.cleared], stays)
-    # The ego stays with H1 after reward with H4, and acts randomly with H4 after no reward with H1.
+    # After reward with H4, the ego stays with H1; after no reward with H1, the ego acts randomly with H4.
     swapped = np.array([result.returns[0] for result in found.swapped])
     np.testing.assert_array_equal(swapped[:, 2:], [stays[0, 2:], wanders[1, 2:]])
     np.testing.assert_array_equal(found.memory[:, 0], (plain - stays).mean(axis=1))
@@ -98,7 +98,7 @@ def test_memory_and_partner_controls_equal_hand_computed_differences(solo_return
 
 
 def test_control_intervals_treat_equal_behaviours_as_one_unit():
-    """The five H4 teammates of one layout behave the same: one seed gives no interval, unlike for H3."""
+    """With one seed, five H4 teammates of equal behaviour give no interval; the different H3 teammates give one."""
     tasks = [task for task in published_tasks("teammate") if task.layout.name == "coord_simple"]
     values = np.arange(4.0)
     for family in ("H4", "H3"):
@@ -133,13 +133,13 @@ def test_protocol_swap_keeps_ego_memory_and_random_keys(solo_returns, programs):
 
 
 def test_stored_control_results_are_reused_only_for_same_partners(programs, tmp_path):
-    """A folder of a control is resumed only with the same partners; results without a control store no partners."""
+    """An evaluation with a control resumes only with the same partners; results without a control store no partners."""
     first = evaluate_controls("mine", ego(PAID), TASKS, FOUR, out=tmp_path, details={"of": 1}, programs=programs)
 
-    def never(layout):
+    def forbidden(layout):
         raise AssertionError("finished tasks are evaluated again")
 
-    assert evaluate_controls("mine", never, TASKS, FOUR, out=tmp_path, details={"of": 1}) == first
+    assert evaluate_controls("mine", forbidden, TASKS, FOUR, out=tmp_path, details={"of": 1}) == first
     plain, cleared, swapped = (results[0].settings for results in first[:3])
     rules = {"name": "seeded", "noise": "seeded", "four_recipes": False, "episodes": 4, "steps": 100}
     assert plain["protocol"] == rules
@@ -149,11 +149,11 @@ def test_stored_control_results_are_reused_only_for_same_partners(programs, tmp_
     assert "partners" not in first.plain[0].to_json()
     message = f"holds a result with the teammates of {H1.task_id}, {H4.task_id}, expected those of {H2.task_id}, "
     with pytest.raises(OptionError, match=message):
-        evaluate("mine", never, [H4, H2, H1], FOUR, control="swapped", out=tmp_path / "swapped", details={"of": 1})
+        evaluate("mine", forbidden, [H4, H2, H1], FOUR, control="swapped", out=tmp_path / "swapped", details={"of": 1})
 
 
 class Recorder:
-    """A host agent that stays, and records its resets and its inputs in the first step of each episode."""
+    """A host agent that always stays; it records its resets and its inputs in the first step of each episode."""
 
     def __init__(self):
         self.log: list[list] = []
@@ -178,7 +178,7 @@ def test_memory_control_resets_host_agents_before_each_episode(tmp_path):
     assert [bool(one.prev_done) for one in plain] == [False, True, True, True]
     assert not any(one.prev_done or one.prev_action for one in cleared)
     assert [bool(one.prev_done) for one in swapped] == [False, True, True, True]
-    for one, other, third in zip(plain, cleared, swapped, strict=True):  # all have the same start states
+    for one, other, third in zip(plain, cleared, swapped, strict=True):  # all evaluations have equal start states
         np.testing.assert_array_equal(one.obs, other.obs)
         np.testing.assert_array_equal(one.obs, third.obs)
 
@@ -235,12 +235,12 @@ class TestPlanTasks:
                 evaluate_controls("stay", stay, TASKS, rules)
         with pytest.raises(UnknownNameError, match=r"unknown control 'swaped'.*Did you mean 'swapped'"):
             evaluate("stay", stay, TASKS, FOUR, control="swaped")  # type: ignore[arg-type]
-        with pytest.raises(OptionError, match=r"protocol swap: the teammate changes every 25 episodes.* found 100"):
+        with pytest.raises(OptionError, match=r"protocol swap: expected at most 25 episodes.* found 100"):
             next(play_tasks(stay, [H4], PROTOCOLS["swap"]))
 
 
 def test_next_segment_starts_with_its_own_recipes():
-    """The first state of a segment is drawn with the previous recipe; `enter` replaces this by the new recipe."""
+    """`move_to_layouts` replaces the recipe of the previous segment in the first state of the next segment."""
     first, second = (
         [make_task("teammate", "test", "coord_simple", H4.teammate, seed, [dish]) for seed in range(2)]
         for dish in ((0, 0, 0), (1, 1, 1))

@@ -68,7 +68,7 @@ def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_retu
     played: list[int] = []
     again = evaluate("random", watched, SIMPLE + RING, PUBLISHED, out=tmp_path, played=played.append)
     assert returns(again) == batch_returns
-    assert played == [5 * 4, 5, 5, 5, 5]  # stored tasks are reported in one call, others after each episode
+    assert played == [5 * 4, 5, 5, 5, 5]  # stored tasks are reported in one call, other tasks after each episode
     assert started == ["coord_ring"]
     assert len(list((tmp_path / "tasks").iterdir())) == 10
     assert read_result(tmp_path / "tasks" / f"{SIMPLE[0].task_id}.json") == first[0]
@@ -130,7 +130,7 @@ def test_damaged_result_file_raises_error(tmp_path):
         read_run(tmp_path)
 
 
-class Watcher:
+class RecordingAgent:
     """A host agent that plays given or random actions and records its inputs."""
 
     def __init__(self, actions=None):
@@ -148,7 +148,7 @@ class Watcher:
 
 
 def test_host_agents_receive_observations_and_rewards():
-    watcher = Watcher()
+    watcher = RecordingAgent()
     protocol = dataclasses.replace(PUBLISHED, episodes=2)
     played = list(play_tasks(from_host(watcher), SIMPLE, protocol))
     record, actions, reward = (np.concatenate([np.asarray(p[k]) for p in played], axis=1) for k in range(3))
@@ -178,7 +178,7 @@ def test_states_and_rewards_of_played_episodes_follow_the_rules():
 
 
 def test_out_of_range_action_of_host_agent_raises_error():
-    watcher = Watcher(lambda batch: np.full(batch, 6))
+    watcher = RecordingAgent(lambda batch: np.full(batch, 6))
     with pytest.raises(OptionError, match=r"returned actions 6\.\.6 on coord_simple, expected 0\.\.5"):
         evaluate("mine", from_host(watcher), SIMPLE, dataclasses.replace(PUBLISHED, episodes=1))
 
@@ -192,7 +192,7 @@ def test_out_of_range_action_of_host_agent_raises_error():
 )
 def test_host_agent_actions_of_wrong_shape_or_type_raise_errors(actions, message):
     """Only the policy is called, since compiling the environment's step takes seconds."""
-    policy, keys = from_host(Watcher(lambda batch: actions))(LAYOUTS["coord_simple"]), jnp.zeros(1, jnp.uint32)
+    policy, keys = from_host(RecordingAgent(lambda batch: actions))(LAYOUTS["coord_simple"]), jnp.zeros(1, jnp.uint32)
     ego_input = EgoInput(jnp.zeros((1, 5, 5, 40)), *[jnp.zeros(1)] * 4)
     memory = policy.init((), keys)
     with pytest.raises(jax.errors.JaxRuntimeError, match=message):
@@ -201,24 +201,24 @@ def test_host_agent_actions_of_wrong_shape_or_type_raise_errors(actions, message
 
 @pytest.mark.parametrize("action", [jnp.zeros(3, jnp.int32), jnp.float32(1)])
 def test_jax_agent_action_of_wrong_shape_or_type_raises_error(action):
-    def mine(layout):
+    def make_ego(layout):
         return Policy((), lambda params, key: (), lambda params, carry, view, key: (action, carry), "observation")
 
     with pytest.raises(OptionError, match=r"expected one integer 0\.\.5 for each"):
-        evaluate("mine", mine, SIMPLE, PUBLISHED)
+        evaluate("mine", make_ego, SIMPLE, PUBLISHED)
 
 
 def test_ego_memory_is_kept_between_episodes_of_a_task():
     """An ego that counts its steps plays `stay` in the first episode and `interact` in the second."""
 
-    def mine(layout):
+    def make_ego(layout):
         def act(params, count, view, key):
             return jnp.where(count < 100, 4, 5), count + 1  # 4 is `stay`, 5 is `interact`
 
         return Policy((), lambda params, key: jnp.int32(0), act, "observation")
 
     protocol = dataclasses.replace(PUBLISHED, episodes=2)
-    first, second = play_tasks(mine, SIMPLE, protocol)
+    first, second = play_tasks(make_ego, SIMPLE, protocol)
     assert (first.actions[..., 0] == 4).all()
     assert (second.actions[..., 0] == 5).all()
 

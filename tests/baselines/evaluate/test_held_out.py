@@ -1,4 +1,4 @@
-"""Evaluation with the learned teammates that a suite of teammates holds out of training."""
+"""Evaluation with learned teammates that a suite of teammates holds out of training."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def suite(tmp_path) -> Path:
     root, layout = tmp_path / "suite", get_layout("cramped_up")
     network, where = ActorCritic(Widths((4,), (4,), 8, 8, 8)), "cramped_up/fcp/m0/c0"
     shapes = jax.eval_shape(lambda: network.untrained(jax.random.key(0), layout.channels))
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # avoids a slow initialization
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # initialization would be slow
     save_policy(root / where, network, zeros, {"seed": 0})
     entry = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0}
     entry["theta"] = {"checkpoint": where, "sha256": file_hash(root / where / POLICY_WEIGHTS)}
@@ -69,4 +69,4 @@ def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, 
     (other / "config.json").write_text(json.dumps(config | {"package_version": "0.0.0"}))
     (results / "run.json").write_text(json.dumps(about | {"run": str(other)}))
     (pair,) = family_gifs([read_run(results)], tmp_path, suite)
-    assert pair.episodes == () and pair.caption.startswith(f"No picture: {other} holds another model than these")
+    assert pair.episodes == () and pair.caption.startswith(f"No picture: {other} holds another model: expected")

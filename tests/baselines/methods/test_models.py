@@ -61,7 +61,7 @@ class TestSizes:
 
 
 def dependence(f, *inputs) -> list[np.ndarray]:
-    """Return bool (O, T) for each input (T, ..): which outputs (O, ..) of f depend on which rows of the input."""
+    """Return a mask (O, T) for each input (T, ..): whether each output (O, ..) of f depends on each input row."""
     jacobians = jax.jit(jax.jacobian(f, argnums=tuple(range(len(inputs)))))(*inputs)
     return [
         np.abs(np.asarray(jacobian).reshape(len(jacobian), -1, len(x), x[0].size)).max(axis=(1, 3)) > 0
@@ -313,7 +313,7 @@ def test_acting_gives_the_outputs_of_training(name):
         (4, 2, "rope"),
     ],
 )
-def test_dpt_acts_by_the_transitions_of_finished_episodes(context, first, positions):
+def test_dpt_uses_the_transitions_of_finished_episodes(context, first, positions):
     method, params = tiny("dpt", positions=positions)
     seen = ego_inputs(11, episode=4)  # two finished episodes, then three steps
     known = np.array([0, 1, 2, 4, 5, 6])[first:]  # steps 3 and 7 end episodes and have no next observation
@@ -382,12 +382,12 @@ class TestChangeIf:
     def test_change_is_not_computed_if_no_row_needs_it(self):
         calls = []
 
-        def noted(params, memory):
+        def count_call(params, memory):
             jax.debug.callback(lambda: calls.append(1))
             return memory
 
         for condition in (jnp.zeros(3, bool), self.CONDITION):
-            jax.block_until_ready(jax.vmap(lambda c: change_if(c, noted, (), jnp.float32(0)))(condition))
+            jax.block_until_ready(jax.vmap(lambda c: change_if(c, count_call, (), jnp.float32(0)))(condition))
             jax.effects_barrier()
             assert bool(calls) == bool(condition.any())
 

@@ -70,7 +70,7 @@ def test_mirrored_views_equal_views_on_the_mirrored_layout(rows, columns):
         mirrored = np.asarray(view.actions(jnp.asarray(actions)))
         one = rules.step(LAYOUT, one, actions, recipe).state
         two = rules.step(other, two, mirrored, recipe).state
-    assert seen > 0  # at some step an item was visible
+    assert seen > 0  # an item was visible at some step
 
 
 def test_hidden_recipe_indicator_looks_like_a_counter():

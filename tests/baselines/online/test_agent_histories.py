@@ -1,4 +1,4 @@
-"""Histories recorded from trained agents: labels, teammates, resume and the release."""
+"""Histories recorded from trained agents: labels, teammates, resumed collection and the release."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.helpers.evaluated import TEST_TASKS
 CONFIG = NoiseConfig(2, 10, start=(1.0, 1.0), end=(0.0, 0.0))
 
 
-def cook(layout: Any) -> Policy:
+def always_interact(layout: Any) -> Policy:
     """Return an agent that always chooses `interact`."""
     return Policy((), lambda params, key: (), lambda params, memory, view, key: (jnp.int32(5), memory), "ego_input")
 
@@ -37,7 +37,7 @@ def idle(layout: Any) -> Policy:
     return stay(layout)._replace(sees="ego_input")
 
 
-COOK = NamedEgo("cook", cook, {"version": 1})
+COOK = NamedEgo("cook", always_interact, {"version": 1})
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def dataset() -> Any:
 
 @pytest.fixture(scope="module")
 def teammates(dataset) -> Teammates:
-    """Return the teammates of `dataset`; for the second one, invented references say that the oracle earns less."""
+    """Return the teammates of `dataset`; by invented returns, the oracle is useless with the second teammate."""
     found = release_teammates(dataset)
     useless = ReferenceEgos(stay=0.0, random=0.0, oracle=-1000.0, episodes=100)
     return found._replace(references={found.tasks[1].task_id: useless})
@@ -98,7 +98,7 @@ def test_noise_decreases_over_episodes_and_labels_have_no_noise(release):
 def test_histories_can_be_labelled_by_another_agent(dataset):
     """The labelling agent receives the inputs of the recorded agent, including the actions that were taken."""
 
-    def counts(layout: Any) -> Policy:
+    def count_stays(layout: Any) -> Policy:
         def act(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
             return jnp.int32((memory + 1) % 6), memory + (ego_input.prev_action == STAY)
 
@@ -106,11 +106,11 @@ def test_histories_can_be_labelled_by_another_agent(dataset):
 
     tasks = release_teammates(dataset).tasks[:1]
     config = NoiseConfig(1, 10, start=(0.0, 0.0))
-    found = agent_histories.record_histories(idle, tasks, config, make_labeller=counts)
+    found = agent_histories.record_histories(idle, tasks, config, make_labeller=count_stays)
     assert (found.actions == STAY).all()
     # The labelling agent counts previous `stay` actions; the first step has no previous action.
     np.testing.assert_array_equal(found.expert_actions[0], (1 + np.maximum(np.arange(1000) - 1, 0)) % 6)
-    with pytest.raises(OptionError, match="the labeller takes state, expected ego_input, as the agent does"):
+    with pytest.raises(OptionError, match="the labeller takes state, expected ego_input, which the agent takes"):
         agent_histories.with_noise(idle(None), 10, AGENTS["oracle"](tasks[0].layout))
 
 

@@ -1,4 +1,4 @@
-"""Best responses and adaptation headroom: groups of tasks, choice of trainings, tables and tiny trainings."""
+"""Best responses and adaptation headroom: groups of tasks, choice of training runs, tables and tiny training runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DEMO = tasks_of("teammate", "demo_wide")
 
 
 def test_with_headroom_drops_tasks_on_which_the_oracle_gains_little():
-    """Headroom of test tasks is stored by layout and family, headroom of validation tasks for each teammate."""
+    """Headroom is stored by layout and family for test tasks, and by teammate for validation tasks."""
     flat = {task.layout.name for task in tasks_of("teammate")} - {
         task.layout.name for task in responses.with_headroom(tasks_of("teammate"))
     }
@@ -59,7 +59,7 @@ def test_best_response_is_chosen_by_separate_episodes(tmp_path):
     path = responses.write_responses(jobs[:1], tmp_path)
     first = read_best_responses(path)
     assert first.behaviours == (responses.choose_best_response(behaviour, [responses.trained_response(jobs[0])]),)
-    responses.write_responses(jobs[1:], tmp_path)  # adds to the stored first training
+    responses.write_responses(jobs[1:], tmp_path)  # the stored result of the first run is kept
     second = read_best_responses(path)
     assert second.behaviours == (entry,)
     assert second.version != first.version

@@ -1,4 +1,4 @@
-"""RL^2: model outputs, training episodes, resume, and the choice of teammates and layouts."""
+"""RL^2: model outputs, training episodes, resumed training, and the choice of teammates and layouts."""
 
 from __future__ import annotations
 
@@ -63,13 +63,13 @@ def teammates(count: int) -> dict[str, Policy]:
 def trainer() -> PlayTrainer:
     groups = make_groups({(LAYOUT, "assembly_line"): teammates(2)}, 8, {LAYOUT.name: 1.0})
     made = PlayTrainer(METHOD, OPTIONS, PLAY, groups, mirror=True)
-    made.init = jax.jit(made._initial_state)  # several tests call it
+    made.init = jax.jit(made._initial_state)  # compiled once for several tests
     return made
 
 
 @pytest.fixture(scope="module")
 def episode(trainer) -> Any:
-    """Return the compiled function by which the trainer's only player plays an episode."""
+    """Return the trainer's compiled function that plays one episode."""
     trainer._compiled = trainer._compile(trainer.init(), jax.random.key(0))
     return trainer._compiled[0]
 
@@ -184,7 +184,7 @@ def test_previous_actions_of_a_first_step_are_not_mirrored():
 
 @pytest.mark.slow
 def test_batch_of_several_layouts_gives_results_of_single_layouts():
-    """Tasks in a batch of several layouts have the results of a batch of one layout."""
+    """Tasks of a layout give equal results in a batch of several layouts and in a batch of this layout alone."""
     layouts = rearranged_layouts(LAYOUT, 3)[::2]
     mate = build_teammate(None, sample_teammate("assembly_line", 0, "train"))
     mixed = [
@@ -280,7 +280,7 @@ class TestPreparing:
         plain, job = (self.prepare(PlayOptions(), of, batch=128) for of in ((), tasks))
         assert plain.about["trained_on"] == [cell for cell in job.about["trained_on"] if cell["source"] != "tasks"]
         added = {cell["algorithm"]: cell for cell in job.about["trained_on"] if cell["source"] == "tasks"}
-        here = [task for task in tasks if task.layout.name == "cramped_up"]  # others are on layouts that are not chosen
+        here = [task for task in tasks if task.layout.name == "cramped_up"]  # only tasks on the chosen layout
         assert sum(cell["tasks"] for cell in added.values()) == len(here)
         assert {cell["layout"] for cell in added.values()} == {"cramped_up"}
         ids = {teammate_id(task.teammate) for task in here}
@@ -318,7 +318,7 @@ class TestPreparing:
         assert job.about["histories"]["layouts"] == ["cramped_down"]
 
     def test_tasks_keep_the_recipe_that_their_teammate_prefers(self):
-        """Check tasks chosen by histories, and tasks from a manifest."""
+        """Tasks chosen by histories and tasks of a manifest both keep one preferred recipe for each teammate."""
         name = "asymm_both_plain"
         tasks = [one for one in read_tasks(manifest_path("preference", "train")) if one.layout.name == name]
         of_histories = self.prepare(PlayOptions(), (), HistoryOptions((name,), source=("search",)), 256)
@@ -357,9 +357,9 @@ class TestPreparing:
                 PlayOptions(),
                 HistoryOptions(("cramped_up", "asymm_right"), source=("noise",)),
                 ("layout", "train", "diverse"),
-                "asymm_right: neither a chosen history nor a task of a manifest",
+                "asymm_right: no chosen history and no task of a manifest",
             ),
-            (PlayOptions(), CHOICE, ("layout", "test"), "none of the 40 tasks is on cramped_up, but on asymm_right, "),
+            (PlayOptions(), CHOICE, ("layout", "test"), "expected tasks on cramped_up, found 40 on asymm_right, "),
             (PlayOptions(), HistoryOptions(("cramped_up",), queries=7), None, "queries = 7: rl2 learns by playing"),
             (
                 PlayOptions(rearranged=6),
@@ -390,4 +390,4 @@ class TestCommand:
         assert agent.details and agent.details["sampled"] is True
         assert trained.hide_recipe == ("cramped_up",)
         task = published_task("cramped_down", "H1/t0")
-        prepare_rollout(agent.make, [task], get_protocol("seeded", 1))  # raises if the policy does not fit the task
+        prepare_rollout(agent.make, [task], get_protocol("seeded", 1))  # an unsuitable policy would raise an error

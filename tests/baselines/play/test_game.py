@@ -1,4 +1,4 @@
-"""Games of people and policies: equal results to an evaluation, partners by name, and egos in the teammate slot."""
+"""Games of people and policies: returns equal to an evaluation's, partners found by name, and egos in either slot."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ STEPS = 12
 
 
 @pytest.fixture
-def served(tmp_path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+def game_server(tmp_path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """Serve a recorded game of one episode; yield the address of the page and the server process."""
     words = f"play --layout cramped_up --with H2/t3 --episodes 1 --steps {STEPS} --ticks 0 --port 0 --seed 3".split()
     command = [sys.executable, "-u", "-m", "icrl4aht_data", *words, "--record", str(tmp_path / "record")]
@@ -43,15 +43,15 @@ def served(tmp_path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
 
 
 @pytest.fixture
-def page(served) -> Iterator[Any]:
+def page(game_server) -> Iterator[Any]:
     """Open the page of the game in a window of a phone's size."""
     with chromium() as open_page:
-        page = open_page(served[0], PHONE, has_touch=True)
+        page = open_page(game_server[0], PHONE, has_touch=True)
         wait_until(page, "setup !== undefined")
         yield page
 
 
-def test_game_in_the_browser_is_recorded_despite_lost_connection(page, served, tmp_path):
+def test_game_in_the_browser_is_recorded_despite_lost_connection(page, game_server, tmp_path):
     """A person plays one recorded episode, and loses the connection in the middle of the episode."""
     assert page.locator("#game").is_hidden()
     page.fill("#pseudonym", "someone")
@@ -85,7 +85,7 @@ def test_game_in_the_browser_is_recorded_despite_lost_connection(page, served, t
     assert page.locator("#means li").count() == 4
 
     page.close()
-    server = served[1]
+    server = game_server[1]
     server.send_signal(signal.SIGINT)
     assert f"{tmp_path / 'record'}: 1 episode;" in server.stdout.read()
     assert server.wait(30) == 0

@@ -13,7 +13,7 @@ from tests.helpers.evaluated import write_measured
 
 
 @pytest.fixture(scope="session")
-def cards(tmp_path_factory) -> Path:
+def response_files(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("cards")
     write_measured(folder / "measured.json")
     write_best_responses(folder / "none.json", BestResponseCard("0", "seeded", "None measured."))
@@ -21,14 +21,14 @@ def cards(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def unmeasured(cards) -> Iterator[None]:
+def no_responses(response_files) -> Iterator[None]:
     """Replace the package's best responses by an empty set."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(best_responses, "best_responses_file", lambda: cards / "none.json")
+        patch.setattr(best_responses, "best_responses_file", lambda: response_files / "none.json")
         yield
 
 
 @pytest.fixture
-def measured(unmeasured, cards, monkeypatch) -> None:
+def invented_responses(no_responses, response_files, monkeypatch) -> None:
     """Replace the package's best responses by the invented ones of `write_measured`."""
-    monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "measured.json")
+    monkeypatch.setattr(best_responses, "best_responses_file", lambda: response_files / "measured.json")

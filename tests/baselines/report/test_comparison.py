@@ -60,7 +60,7 @@ def test_stored_results_have_blocks_and_curves_and_can_be_read_again(stored, tmp
     pd.testing.assert_frame_equal(again.curves, stored.curves, check_dtype=False)
 
 
-def test_agents_table_has_scores_of_complete_tracks_only(stored, measured):
+def test_agents_table_has_scores_of_complete_tracks_only(stored, invented_responses):
     scales = cell_scales("seeded")
     table = comparison.agents_table(stored, stored.returns(), scales)
     high, low = row(table, "high"), row(table, "low")
@@ -73,7 +73,7 @@ def test_agents_table_has_scores_of_complete_tracks_only(stored, measured):
     assert comparison.describe_lead(stored.returns(), scales) == "No two models have a score on the track `teammate`."
 
 
-def test_lead_is_the_difference_of_the_two_highest_scores(tmp_path, measured):
+def test_lead_is_the_difference_of_the_two_highest_scores(tmp_path, invented_responses):
     found = StoredResults()
     for name, value in {"a": 3.0, "b": 9.0, "c": 5.0}.items():
         folder = write_results(tmp_path / name, name, [value] * 100, track="teammate")
@@ -82,7 +82,7 @@ def test_lead_is_the_difference_of_the_two_highest_scores(tmp_path, measured):
     assert "differ by +0.20 (+0.20 to +0.20): `b` minus `c`" in lead
 
 
-def test_controls_table_has_memory_and_partner_controls_and_blocks(stored, measured):
+def test_controls_table_has_memory_and_partner_controls_and_blocks(stored, invented_responses):
     table = comparison.controls_table(stored, stored.returns(), cell_scales("seeded"))
     high, low = row(table, "high"), row(table, "low")
     assert high[1].startswith("**+15.5 (") and high[1].endswith(")**"), "19.5 + 2 - (5 + 1)"
@@ -90,7 +90,7 @@ def test_controls_table_has_memory_and_partner_controls_and_blocks(stored, measu
     assert low[1:] == ["–", "–", "0.0", "0.0", "10.0", "10.0"]
 
 
-def test_layouts_table_has_reference_egos_and_returns_by_layout(stored, measured):
+def test_layouts_table_has_reference_egos_and_returns_by_layout(stored, invented_responses):
     table = comparison.layouts_table(stored.returns(), cell_scales("seeded"))
     assert row(table, "stay")[1:4] == ["12.8", "13.0", "12.7"] and "| best response | 12.8 | 18.0 |" in table
     low = row(table, "low")
@@ -100,7 +100,7 @@ def test_layouts_table_has_reference_egos_and_returns_by_layout(stored, measured
     assert row(none, "low")[7:] == ["9.5", "9.5", "–", "–"] and "| best response | – |" in none
 
 
-def test_mean_best_uses_stay_for_families_without_best_response(measured):
+def test_mean_best_uses_stay_for_families_without_best_response(invented_responses):
     scales, stay = cell_scales("seeded"), read_headroom("seeded")
     ring = [cell for cell in scales if cell.layout == "coord_ring"]
     h2 = next(cell for cell in ring if cell.family == "H2")
@@ -109,7 +109,7 @@ def test_mean_best_uses_stay_for_families_without_best_response(measured):
     assert comparison.mean_best("coord_ring", {cell: scales[cell] for cell in scales if cell not in ring}) is None
 
 
-def test_results_page_is_written_with_and_without_best_responses(stored, tmp_path, cards, monkeypatch):
+def test_results_page_is_written_with_and_without_best_responses(stored, tmp_path, response_files, monkeypatch):
     old = stored.agents | {"low": AgentFacts("an old one", "noise", "oracle", commit="71f723c")}
     some = dataclasses.replace(stored, agents=old)
     paths = comparison.write_comparison(some, tmp_path / "page")
@@ -119,7 +119,7 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
     assert "The rows include models of earlier code: `low`." in text and "None measured (version" in text
     assert paths[1].stat().st_size > 10_000 and len(comparison.figure_layouts()) == 6
     assert len(pd.read_parquet(paths[3])) == len(stored.table)
-    monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "measured.json")
+    monkeypatch.setattr(best_responses, "best_responses_file", lambda: response_files / "measured.json")
     table = add_scales(stored.table)
     down = table[table["layout"] == "cramped_down"]
     assert len(table) == len(stored.table) and set((down["best"] - down["stay"]).dropna()) == {20}

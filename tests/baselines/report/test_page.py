@@ -25,7 +25,7 @@ from icrl4aht_data.errors import OptionError
 from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 
-GIF = b"GIF89a"  # no complete image, since the report does not decode it
+GIF = b"GIF89a"  # an incomplete image, which the report does not decode
 EVIL = '<img src=x onerror="alert(1)">&co'
 
 
@@ -92,7 +92,7 @@ def test_html_report_names_conditions_once_and_marks_overlaps(tmp_path):
     text = unescape(write_page(runs, tmp_path / "report.html").read_text())
     assert text.count("Evaluated under protocol seeded, 1 seed (0), 40 episodes of 100 steps; 5 instances") == 1
     assert text.count('<i class="key"></i>AD †</span>') == text.count('<i class="key"></i>mine ?</span>') == 2
-    (chart,) = bar_charts(dict(enumerate(runs)), "seeded")  # shows returns, since no best response is measured
+    (chart,) = bar_charts(dict(enumerate(runs)), "seeded")  # bars show returns if no best response is measured
     marks = [[bar.text.lstrip("-0123456789.") for bar in row.bars] for row in chart.bars["demo_wide"]]
     assert marks == [["", "?"]] * 3 + [["†", "?"]]
     short = evaluated_run("DPT", steps=20)
@@ -109,7 +109,7 @@ def test_html_report_without_scores_has_no_score_columns(tmp_path):
     assert "one under protocol seeded, 3 seeds (0 to 2), 40 episodes" in text
 
 
-def test_score_bars_start_at_the_return_of_stay(measured, tmp_path):
+def test_score_bars_start_at_the_return_of_stay(invented_responses, tmp_path):
     run = evaluated_run("mine", ("coord_simple", "demo_wide"), value=9.0)
     (chart,) = bar_charts({0: run}, "seeded")
     (rows,) = chart.bars.values()
@@ -141,7 +141,7 @@ def test_curves_share_axes_and_can_have_one_episode():
 
 
 def trained(run: EvaluationRun, **model) -> EvaluationRun:
-    """Add a training record on the run's layouts to the results of an evaluation."""
+    """Return the run with an added record of training on the run's layouts."""
     histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": [*run.sources[0].layouts], "data_version": "1.0.0"}
     histories |= {"sizes": {"train": 14}, "queries": 201, "every": 1, "labels": "oracle"}
     config = {"method": "dpt", "model": model, "train": {"seed": 3}, "package_version": "0", "histories": histories}
@@ -150,7 +150,7 @@ def trained(run: EvaluationRun, **model) -> EvaluationRun:
 
 
 def test_model_cards_describe_the_training_data():
-    """Cards of the bundled models contain the sentence on training data that their configuration gives."""
+    """The card of each bundled model contains the training-data sentence that its configuration gives."""
     for name in ("ad-reference", "ad-rising", "dpt-reference", "rl2-reference"):
         configs = [json.loads((MODELS / name / track / "config.json").read_text()) for track in TRACKS]
         card = (MODELS / name / "README.md").read_text(encoding="utf-8")
@@ -176,7 +176,7 @@ def test_headroom_card_lists_layouts_and_families_without_headroom(tmp_path):
     assert "**0.0 / 0.0 / 39.9**" in text and "No headroom: coord_simple/H1, coord_simple/H2" in text
 
 
-def test_shown_episodes_are_of_tasks_with_headroom(measured, tmp_path, monkeypatch):
+def test_shown_episodes_are_of_tasks_with_headroom(invented_responses, tmp_path, monkeypatch):
     """Episodes are shown for layouts and families with headroom, and not for reference egos."""
     (tmp_path / "a.gif").write_bytes(GIF)
     monkeypatch.setattr(gifs, "save_episodes", lambda *a, **k: (ShownEpisode(1, 7.0, tmp_path / "a.gif"),))

@@ -21,21 +21,21 @@ from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 H4 = next(task.teammate for task in TEST_TASKS if (task.layout.name, task.teammate_family) == ("demo_wide", "H4"))
 
 
-def own_h4(number: int) -> dict[str, Any]:
+def h4_teammate(number: int) -> dict[str, Any]:
     return H4 | {"theta_id": 50 + number, "theta": H4["theta"] | {"inertia": number / 100}}
 
 
-def learned(number: int) -> dict[str, Any]:
+def learned_teammate(number: int) -> dict[str, Any]:
     theta = {"checkpoint": f"fcp/{number}", "sha256": f"{number:064x}"[::-1]}
     return {"kind": "rl", "family": "fcp", "theta_id": number, "base_seed": 0, "theta": theta}
 
 
 TASKS: dict[str, list[Task]] = {
     "test": [task for task in TEST_TASKS if task.teammate == H4 and task.layout.name == "demo_wide"][:1],
-    "training": [make_task("teammate", "train", "demo_wide", own_h4(1), 1)],
-    "validation": [make_task("teammate", "validation", "demo_wide", own_h4(2), 2)],
-    "held out": [make_task("layout", "heldout", "cramped_up", learned(1), 3)],
-    "own": [make_task("teammate", "test", "demo_wide", own_h4(3), 4)],
+    "training": [make_task("teammate", "train", "demo_wide", h4_teammate(1), 1)],
+    "validation": [make_task("teammate", "validation", "demo_wide", h4_teammate(2), 2)],
+    "held out": [make_task("layout", "heldout", "cramped_up", learned_teammate(1), 3)],
+    "own": [make_task("teammate", "test", "demo_wide", h4_teammate(3), 4)],
 }
 LAYOUT_TEST = [task for task in TEST_TASKS if task.layout.name == "asymm_right" and task.teammate_family == "H1"]
 
@@ -55,7 +55,7 @@ def test_results_table_has_a_row_for_each_task_seed_and_block():
     assert (of.tasks, of.seeds) == (tuple(task_label(task.task_id) for task in tasks), (3, 4))
     np.testing.assert_array_equal(of.blocks["all"], [[[3.8, 0.0], [10.0, 20.0]]])
     assert set(run.table["overlap"]) == {"unknown"}
-    with pytest.raises(OptionError, match="results of different settings in one run"):
+    with pytest.raises(OptionError, match="results with equal settings, found different settings"):
         as_run([Result(tasks[0].task_id, settings, [[1.0]]), Result(tasks[1].task_id, {}, [[1.0]])])
 
 
@@ -83,7 +83,7 @@ def test_results_of_different_kinds_of_tasks_are_kept_apart(kind):
         (TASKS["validation"], [], []),
         (TASKS["validation"], [{"family": "rl", "algorithm": "comedi", "teammates": ["00"]}], []),
         (TASKS["validation"], [{"family": "H4", "algorithm": "utility_greedy", "teammates": ["00"]}], ["family"]),
-        (TASKS["validation"], [{"family": "H4", "teammates": [teammate_id(own_h4(2))]}], ["teammate"]),
+        (TASKS["validation"], [{"family": "H4", "teammates": [teammate_id(h4_teammate(2))]}], ["teammate"]),
         (TASKS["held out"], [{"family": "rl", "algorithm": "brdiv", "teammates": None}], []),
         (TASKS["held out"], [{"family": "rl", "algorithm": "fcp", "teammates": None}], ["family"]),
         (LAYOUT_TEST, [{"layout": "asymm_right", "family": "rl", "algorithm": "fcp", "teammates": []}], ["layout"]),

@@ -79,7 +79,7 @@ def test_teammates_with_equal_behaviour_count_as_one_unit():
     assert single and single.total == pytest.approx(pair[0].total) and pair[0].total.range()
 
 
-def test_layout_with_a_missing_best_response_has_no_score(measured, monkeypatch, tmp_path):
+def test_layout_with_a_missing_best_response_has_no_score(invented_responses, monkeypatch, tmp_path):
     """If one best response on demo_wide is missing, scores exist for all other layouts."""
     card = read_best_responses(best_responses.best_responses_file())
     lacks = next(one for one in card.behaviours if (one.layout, one.family) == ("demo_wide", "H1"))
@@ -90,7 +90,7 @@ def test_layout_with_a_missing_best_response_has_no_score(measured, monkeypatch,
     assert len(found) == 16 and "demo_wide" not in {cell.layout for cell in found}
 
 
-def test_score_scales_cover_all_tasks_with_a_best_response(measured):
+def test_score_scales_cover_all_tasks_with_a_best_response(invented_responses):
     scales = scores.cell_scales("seeded")
     assert (
         len(scores.open_cells(scales)) == 20
@@ -116,7 +116,7 @@ def test_damaged_file_of_best_responses_raises_error(tmp_path):
         read_best_responses(tmp_path / "bad.json")
 
 
-def test_summary_of_a_run_has_score_and_return_by_episode(measured):
+def test_summary_of_a_run_has_score_and_return_by_episode(invented_responses):
     (found,) = scores.find_headlines(evaluated_run("mine", ("coord_simple", "demo_wide")))
     assert found.score and found.score.total[:3] == pytest.approx((11.0 / SPAN,) * 3), "equal instances"
     assert found.text == (
@@ -126,7 +126,7 @@ def test_summary_of_a_run_has_score_and_return_by_episode(measured):
     )
 
 
-def test_results_without_a_score_have_a_reason(measured):
+def test_results_without_a_score_have_a_reason(invented_responses):
     (short,) = scores.find_headlines(evaluated_run("mine", steps=20))
     assert short.score is None and short.why_no_score.startswith("No score: it needs all tasks of a cell with a best")
     (flat,) = scores.find_headlines(evaluated_run("mine", ("coord_simple",)))
@@ -171,7 +171,7 @@ def test_published_numbers_are_found_for_complete_groups_only():
     assert found == [(-7.6, None), *2 * [tuple(page.published_cells("AD")["test_wide"][page.AVERAGE])]]
 
 
-def test_incomplete_results_and_missing_headroom_are_marked(measured):
+def test_incomplete_results_and_missing_headroom_are_marked(invented_responses):
     found = page.table_score(DEMO_WIDE, evaluated_run("AD", families=("H1", "H2")), "seeded")
     assert (found.text, found.notes[:2]) == ("11.0 ± 0.0", ["2 of 4 cells", "score 0.55"])
     few = evaluated_run("AD", tasks=[task for task in TEST_TASKS if task.layout.name == "demo_wide"][:2])
@@ -184,7 +184,7 @@ def test_incomplete_results_and_missing_headroom_are_marked(measured):
     assert not page.table_score([flat_cell._replace(kind="validation")], None, "seeded").is_flat, "nothing was measured"
 
 
-def test_csv_and_markdown_reports_have_all_numbers(measured):
+def test_csv_and_markdown_reports_have_all_numbers(invented_responses):
     runs = [evaluated_run("AD", protocol="published", trained_on=None), evaluated_run("AD", note="K250")]
     found = pd.read_csv(StringIO(page.csv_text(runs)), keep_default_na=False)
     assert set(found["agent"]) == {"AD", "AD [K250]"} and set(found["block"]) == {*BLOCKS}

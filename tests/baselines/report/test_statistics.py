@@ -18,7 +18,7 @@ from icrl4aht_baselines.report.statistics import (
 from scipy.stats import ttest_1samp
 
 
-def test_interval_and_p_value_of_normal_values_are_close_to_students():
+def test_interval_and_p_value_of_normal_values_are_close_to_students_t():
     values = np.random.default_rng(3).normal(0.3, 1.0, 40)
     found = mean_interval(values)
     expected: Any = ttest_1samp(values, 0.0)
@@ -44,7 +44,7 @@ def test_intervals_resample_instances_but_not_groups():
     assert mean_interval(np.full(3, 0.0), np.full(3, 10.0))[:3] == pytest.approx((5.0, 5.0, 5.0))
 
 
-def test_ratio_is_of_sums_and_several_trainings_widen_its_interval():
+def test_ratio_of_sums_has_a_wider_interval_over_training_runs():
     gains, scales = np.array([[1.0, 3.0, 2.0, 4.0]]), np.array([2.0, 4.0, 2.0, 8.0])
     one = Stratum(gains, scales)
     assert ratio_interval([[one], [Stratum(gains[:, :2], scales[:2])]]).mean == pytest.approx((10 / 16 + 4 / 6) / 2)
@@ -69,7 +69,7 @@ def test_holm_corrects_p_values():
 @pytest.mark.slow
 @pytest.mark.parametrize("trainings", [1, 5])
 def test_intervals_have_the_stated_coverage(trainings):
-    """Simulate four groups of five units with unequal variances, and an effect that all units of a training share."""
+    """Simulate four groups of five units with unequal variances, and an effect that is common to each training run."""
     rng, covered, rounds = np.random.default_rng(1), 0, 800
     for _ in range(rounds):
         common = rng.normal(0.0, 0.5, (trainings, 1)) if trainings > 1 else np.zeros((1, 1))

@@ -22,7 +22,7 @@ FACTS = AgentFacts("a rule", "none", "none")
 
 @pytest.fixture(scope="module")
 def submitted(tmp_path_factory) -> Path:
-    """Write a submission of two trainings of an agent; the second training has results with memory cleared."""
+    """Write a submission of two training runs of an agent; the second run also has results with memory cleared."""
     folder = tmp_path_factory.mktemp("submitted")
     write_results(folder / "one", "rule", CURVE)
     write_results(folder / "two", "rule", CURVE, trained_on=[{"layout": "asymm_both", "family": "H1"}])
@@ -39,14 +39,14 @@ def test_submission_has_all_results_of_all_folders(submitted):
     assert next(iter(found.evaluations[0].returns.values())) == [CURVE] * 3
 
 
-def changed(path: Path, target: Path, change: Any) -> Path:
+def changed_submission(path: Path, target: Path, change: Any) -> Path:
     content = json.loads(path.read_text())
     change(content, content["evaluations"][0], next(iter(content["evaluations"][0]["returns"])))
     target.write_text(json.dumps(content))
     return target
 
 
-def rename(one: dict[str, Any], task: str, name: str) -> None:
+def rename_task(one: dict[str, Any], task: str, name: str) -> None:
     one["returns"][name] = one["returns"].pop(task)
 
 
@@ -66,12 +66,12 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: one.update(control="swap"), "control 'swap', expected cleared or swapped"),
         (lambda c, one, task: c["evaluations"].append(one), "two results of a task"),
         (lambda c, one, task: one["returns"].pop(task), "1 of the 40 test tasks of layout are missing, such as layout"),
-        (lambda c, one, task: rename(one, task, OTHER), f"task {OTHER} is not one of the 40 test tasks of layout"),
+        (lambda c, one, task: rename_task(one, task, OTHER), f"task {OTHER} is not one of the 40 test tasks of layout"),
         (lambda c, one, task: c.update(tracks=["teammate"]), "is not one of the 120 test tasks of teammate"),
         (lambda c, one, task: one["settings"].update(seeds=[0, 1]), r"seeds \[0, 1\], expected \[0, 1, 2\]"),
         (lambda c, one, task: one["returns"][task].pop(), r"has 2 lists of \[100\] returns, expected 3 of 100"),
         (lambda c, one, task: one["settings"]["protocol"].update(name="published"), "protocol {'name': 'published'"),
-        (lambda c, one, task: c.update(evaluations=c["evaluations"][2:]), "only results of controls"),
+        (lambda c, one, task: c.update(evaluations=c["evaluations"][2:]), "found only controls"),
         (lambda c, one, task: one["settings"]["details"].update(forget=True), "of cleared, expected no control"),
         (lambda c, one, task: c["evaluations"][2]["settings"]["details"].clear(), "of no control, expected cleared"),
         (lambda c, one, task: c["facts"].update(data=""), "Expected `str` of length >= 1 - at `\\$.facts.data`"),
@@ -79,7 +79,7 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
 )  # fmt: skip
 def test_incomplete_or_invalid_submission_raises_error(submitted, tmp_path, change, message):
     with pytest.raises(OptionError, match=message) as caught:
-        read_submission(changed(submitted, tmp_path / "bad.json", change))
+        read_submission(changed_submission(submitted, tmp_path / "bad.json", change))
     assert str(caught.value).startswith(str(tmp_path / "bad.json"))
 
 
@@ -118,9 +118,9 @@ def test_submit_and_results_commands_write_file_and_page(submitted, tmp_path, mo
     assert list(comparison.read_stored(tmp_path / "stored.json").agents) == ["rule", "my rule"]
     said = ["submit", folder, *said[:-1], "Rule", "--out", str(tmp_path / "again.json")]
     for words, message in (
-        ([*page, "--overwrite"], "the page has results of an agent rule already"),
-        (said, "mine: the page has results of an agent rule already"),
-        ([*said, "--update"], "updates the agent Rule, which the page does not have"),
+        ([*page, "--overwrite"], "the page already has results of an agent rule;"),
+        (said, "mine: the page already has results of an agent rule;"),
+        ([*said, "--update"], "updates the agent Rule, which is not on the page"),
     ):
         with pytest.raises(OptionError, match=message):
             run_cli(*words)
@@ -135,7 +135,7 @@ def test_results_with_sampled_actions_are_added_to_an_agent(tmp_path):
     both = make_submission([drawn, own], FACTS)
     assert (both.agent, [one.control for one in both.evaluations]) == ("mine", ["sampled", ""])
     stored = comparison.add_submission(comparison.StoredResults(), make_submission([own], FACTS))
-    with pytest.raises(OptionError, match="only results of controls or of another play mode, expected results of the"):
+    with pytest.raises(OptionError, match="expected results of the agent itself, found only controls or another play"):
         make_submission([drawn], FACTS)
     later = comparison.add_submission(stored, make_submission([drawn], AgentFacts("x", "x", "x"), update=True))
     assert len(later.table) == 2 * len(stored.table) and later.agents == {"mine": FACTS}

@@ -1,4 +1,4 @@
-"""The trainer: training steps, exact resume, several devices and processes, held-out data, run folders."""
+"""The trainer: training steps, exact resumption, several devices and processes, held-out data, run folders."""
 
 from __future__ import annotations
 
@@ -59,22 +59,22 @@ class Rows:
 
 
 @cache
-def compiled() -> Trainer:
+def shared_trainer() -> Trainer:
     """Return a trainer that all tests share, for the method with the largest training state."""
     return Trainer(get_method("amago_offline")(MODEL, FLAT), OPTIONS)
 
 
-def trained(folder: Path, die_at: int | None = None, changes: Any = None, **options: Any) -> TrainState:
+def train_tiny(folder: Path, die_at: int | None = None, changes: Any = None, **options: Any) -> TrainState:
     data = TrainingData(Rows(0, die_at), {"held out": Rows(1)})
     settings = dataclasses.replace(OPTIONS, **(changes or {}))
-    return TrainingTask(compiled().method, data, settings, {}, compiled()).train(folder, **options)
+    return TrainingTask(shared_trainer().method, data, settings, {}, shared_trainer()).train(folder, **options)
 
 
 @pytest.fixture(scope="module")
 def full_run(tmp_path_factory) -> tuple[Path, TrainState]:
-    """Return the folder and the final state of a training without interruption."""
+    """Return the folder and the final state of an uninterrupted training run."""
     folder = tmp_path_factory.mktemp("runs") / "through"
-    return folder, trained(folder)
+    return folder, train_tiny(folder)
 
 
 def assert_same(one: Any, two: Any) -> None:
@@ -84,12 +84,12 @@ def assert_same(one: Any, two: Any) -> None:
 class TestResume:
     def test_killed_training_resumes_bit_for_bit(self, full_run, tmp_path):
         with pytest.raises(KeyboardInterrupt):
-            # Training dies after the checkpoint of step 3 and the logged line of step 4.
-            trained(tmp_path, die_at=5, log_to=["tensorboard"])
+            # The training run dies after the checkpoint of step 3 and the logged line of step 4.
+            train_tiny(tmp_path, die_at=5, log_to=["tensorboard"])
         assert Checkpoints(tmp_path / CHECKPOINTS).latest == 3
         with (tmp_path / "metrics.jsonl").open("a") as log:
             log.write('{"step": 5, "cut o')
-        state = trained(tmp_path, log_to=["tensorboard"])
+        state = train_tiny(tmp_path, log_to=["tensorboard"])
         assert {path.name for path in (tmp_path / "tensorboard").iterdir()} == {"train", "held out"}
         assert_same(state, full_run[1])
         assert (tmp_path / "metrics.jsonl").read_bytes() == (full_run[0] / "metrics.jsonl").read_bytes()
@@ -97,7 +97,7 @@ class TestResume:
 
     def test_training_a_finished_run_again_changes_nothing(self, full_run):
         log = (full_run[0] / "metrics.jsonl").read_bytes()
-        assert_same(trained(full_run[0]), full_run[1])
+        assert_same(train_tiny(full_run[0]), full_run[1])
         assert (full_run[0] / "metrics.jsonl").read_bytes() == log
 
     def test_training_writes_log_curves_and_settings(self, full_run):
@@ -121,12 +121,12 @@ class TestResume:
     def test_missing_logging_library_raises_error_before_training(self, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "wandb", None)
         with pytest.raises(OptionError, match="needs wandb: pip install"):
-            trained(tmp_path / "run", log_to=["json", "wandb"])
+            train_tiny(tmp_path / "run", log_to=["json", "wandb"])
         assert not (tmp_path / "run").exists()
 
     def test_training_with_other_settings_than_the_run_raises_error(self, full_run):
         with pytest.raises(OptionError, match=r"other settings \(train.seed: it has 0, expected 3\); give another"):
-            trained(full_run[0], changes={"seed": 3})
+            train_tiny(full_run[0], changes={"seed": 3})
 
 
 def terminate_at_4(step: int, loss: float | None) -> None:
@@ -141,16 +141,16 @@ class TestStopping:
     def test_checkpoints_are_saved_after_a_time_interval(self, tmp_path, monkeypatch):
         monkeypatch.setattr("icrl4aht_baselines.training.trainer.SAVE_MINUTES", 1e-9)
         with pytest.raises(KeyboardInterrupt):
-            trained(tmp_path, die_at=5)
+            train_tiny(tmp_path, die_at=5)
         assert Checkpoints(tmp_path / CHECKPOINTS).steps == [4, 5]  # without SAVE_MINUTES, only step 3 would be saved
 
     def test_sigterm_saves_checkpoint_and_training_resumes_bit_for_bit(self, full_run, tmp_path):
-        with pytest.raises(TrainingStopped, match=r"stopped by SIGTERM after step 4 of 7.* resumes it") as stopped:
-            trained(tmp_path, done=terminate_at_4)
+        with pytest.raises(TrainingStopped, match=r"stopped by SIGTERM after step 4 of 7.* resumes the run") as stopped:
+            train_tiny(tmp_path, done=terminate_at_4)
         assert stopped.value.code == 143
         assert Checkpoints(tmp_path / CHECKPOINTS).latest == 4
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-        assert_same(trained(tmp_path), full_run[1])
+        assert_same(train_tiny(tmp_path), full_run[1])
         for name in ("metrics.jsonl", "config.json"):
             assert (tmp_path / name).read_bytes() == (full_run[0] / name).read_bytes()
 
@@ -174,15 +174,15 @@ class TestStopping:
             assert pool.submit(other_thread).result() is signal.getsignal(signal.SIGINT)
 
     def test_processes_agree_on_saving_and_stopping(self, monkeypatch):
-        def agreed(*every_process: tuple[int, int]) -> tuple[bool, int]:
+        def decision(*every_process: tuple[int, int]) -> tuple[bool, int]:
             monkeypatch.setattr(jax, "process_count", lambda: len(every_process))
             monkeypatch.setattr(multihost_utils, "process_allgather", lambda own: np.array(every_process))
             return training.agree_on_stop(bool(every_process[-1][0]), every_process[-1][1])
 
-        assert agreed((1, 0), (0, 0)) == (True, 0)  # process 0 decides when to save
-        assert agreed((0, 0), (1, 0)) == (False, 0)
-        assert agreed((0, 0), (0, 15)) == agreed((0, 15), (0, 0)) == (False, 15)
-        assert agreed((1, 2)) == (True, 2)
+        assert decision((1, 0), (0, 0)) == (True, 0)  # process 0 decides when to save
+        assert decision((0, 0), (1, 0)) == (False, 0)
+        assert decision((0, 0), (0, 15)) == decision((0, 15), (0, 0)) == (False, 15)
+        assert decision((1, 2)) == (True, 2)
 
 
 class TestFolder:
@@ -198,10 +198,10 @@ class TestFolder:
     def test_run_folder_with_other_files_raises_error(self, tmp_path):
         (tmp_path / "notes.txt").touch()
         with pytest.raises(OptionError, match=r"has other files \(notes.txt\), expected a run, or an empty or new"):
-            trained(tmp_path)
+            train_tiny(tmp_path)
         assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-        with pytest.raises(OptionError, match="a file is where a folder is needed"):
-            trained(tmp_path / "notes.txt")
+        with pytest.raises(OptionError, match="expected a folder, found a file"):
+            train_tiny(tmp_path / "notes.txt")
 
 
 class TestStep:
@@ -243,7 +243,7 @@ def long_ppo(tmp_path_factory) -> Path:
 
 
 def job(root: Path | None, method: str = "ad", layout: str = "demo_wide", context: int = 7, **choice: Any) -> Any:
-    """Return a training on histories of a release; None as its folder selects the bundled release."""
+    """Return a training job on histories of a release; `root=None` selects the bundled release."""
     options = dataclasses.replace(OPTIONS, context=context)
     return prepare(method, MODEL, options, HistoryOptions((layout,), root and str(root), **choice))
 
@@ -279,7 +279,7 @@ class TestHeldOut:
 
     def test_tasks_with_one_history_are_not_held_out(self, two_sources):
         dataset = load_icrl4aht(two_sources[0], source="ppo", layout="demo_wide")
-        split = hold_out(dataset[3:8], validation=dataset[:1])  # the first task has one history, the second four
+        split = hold_out(dataset[3:8], validation=dataset[:1])  # tasks of one history and of four histories
         assert split.train.ids.tolist()[0] == dataset.ids[3]
         assert split.histories is not None
         assert (len(split.train), len(split.histories)) == (4, 1)
@@ -328,19 +328,19 @@ class TestHeldOut:
         (cell,) = job(None, layout="demo_simple", algorithm=(one,), source=("ppo",)).about["trained_on"]
         names = {"layout": "demo_simple", "split": "train", "family": "rl", "algorithm": one, "source": "ppo"}
         assert cell.items() >= names.items()
-        assert cell["histories"] < len(load_icrl4aht(layout="demo_simple", teammate_kind=one))  # the rest is held out
+        assert cell["histories"] < len(load_icrl4aht(layout="demo_simple", teammate_kind=one))  # some are held out
 
     @pytest.mark.parametrize(
         ("filters", "message"),
         [
             (
                 {"algorithm": ("fpc",)},
-                r"algorithm = fpc: none of .*; these have assembly_line, fcp, .*: choose",
+                r"algorithm = fpc: not in .*, which has assembly_line, fcp, .*; choose",
             ),
-            ({"source": ("ppo", "dqn")}, "source = dqn: none of .*; these have agent, noise, ppo: choose"),
+            ({"source": ("ppo", "dqn")}, "source = dqn: not in .*, which has agent, noise, ppo; choose"),
             (
                 {"teammate_family": ("rl",), "algorithm": ("assembly_line",)},
-                "^teammate_family = rl, algorithm = assembly_line: none of .* on asymm_both.* has these together",
+                "^teammate_family = rl, algorithm = assembly_line: no history of .* on asymm_both.* has all of these",
             ),
         ],
     )
@@ -410,7 +410,7 @@ def test_processes_split_the_rows_of_a_batch(lite, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def on_one_device(lite, tmp_path_factory) -> list[dict[str, Any]]:
+def one_device_log(lite, tmp_path_factory) -> list[dict[str, Any]]:
     folder = tmp_path_factory.mktemp("one")
     return train_across(lite[0], folder, [{}])
 
@@ -438,16 +438,16 @@ def assert_close(one: list[dict[str, Any]], two: list[dict[str, Any]]) -> None:
 
 
 @pytest.mark.slow
-def test_two_devices_give_the_log_of_one_device(lite, tmp_path, on_one_device):
+def test_two_devices_give_the_log_of_one_device(lite, tmp_path, one_device_log):
     """Two devices give the same log as one device, with dropout, gradient accumulation and validation."""
     two = train_across(lite[0], tmp_path, [{"XLA_FLAGS": add_xla_flag("--xla_force_host_platform_device_count=2")}])
-    assert_close(two, on_one_device)
+    assert_close(two, one_device_log)
 
 
 @pytest.mark.slow
-def test_two_processes_stop_together_and_give_the_log_of_one_device(lite, tmp_path, on_one_device):
-    """After a SIGTERM to process 1, both processes save a checkpoint; the same command resumes the training."""
-    with socket.socket() as held:  # reserves the port for JAX's coordinator, which can share it
+def test_two_processes_stop_together_and_give_the_log_of_one_device(lite, tmp_path, one_device_log):
+    """After a SIGTERM to process 1, both processes save a checkpoint; the same command resumes training."""
+    with socket.socket() as held:  # keeps the port free for JAX's coordinator, which can share it
         held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         held.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{held.getsockname()[1]}"
@@ -456,4 +456,4 @@ def test_two_processes_stop_together_and_give_the_log_of_one_device(lite, tmp_pa
         assert [line["step"] for line in stopped] == [1]
         assert Checkpoints(tmp_path / "run" / CHECKPOINTS).steps == [1]
         two = train_across(lite[0], tmp_path, both, address)
-    assert_close(two, on_one_device)
+    assert_close(two, one_device_log)

@@ -27,7 +27,7 @@ def env():
     return gymnasium.make(NAME)
 
 
-# Gymnasium takes observations of 5x5 cells for images and advises to resize them.
+# Gymnasium takes observations of 5x5 cells for images and warns that they should be resized.
 @pytest.mark.filterwarnings("ignore:.*resize")
 def test_environment_passes_the_checker_of_gymnasium():
     check_env(gymnasium.make(NAME, channels="canonical", render_mode="rgb_array").unwrapped)
@@ -42,7 +42,7 @@ def test_every_published_test_task_has_an_environment_id():
 
 
 def test_module_prefix_of_an_environment_id_imports_the_package():
-    """The other tests rely on ids that importing the package registers."""
+    """In a new process, no id is registered until the prefix imports the package."""
     code = f"import gymnasium; print(gymnasium.make('icrl4aht_data:{NAME}').spec.id)"
     assert run_python("-c", code).strip() == NAME
 

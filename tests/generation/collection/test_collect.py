@@ -58,7 +58,7 @@ def stop_after(updates: int):
     return report
 
 
-def never(updates, speed):
+def forbidden(updates, speed):
     raise AssertionError("expected no further update of the task")
 
 
@@ -119,7 +119,7 @@ def test_collection_killed_after_the_last_update_resumes(built, job, monkeypatch
 def test_collection_killed_before_renaming_its_folder_resumes(built, job):
     shutil.copytree(artefact(built / "a"), partial_folder(job.folder))
     (partial_folder(job.folder) / LEARNER).write_bytes(b"no longer needed")
-    job.run(never)
+    job.run(forbidden)
     assert not compare_rebuilds(job.folder, artefact(built / "a")).differences
 
 
@@ -143,7 +143,7 @@ def test_partial_collection_with_other_settings_starts_again(job, tmp_path, monk
 def test_collecting_a_finished_task_again_changes_nothing(built, job):
     shutil.copytree(artefact(built / "a"), job.folder)
     before = (job.folder / METADATA).stat().st_mtime_ns
-    job.run(never)
+    job.run(forbidden)
     assert (job.folder / METADATA).stat().st_mtime_ns == before
 
 
@@ -152,9 +152,9 @@ def test_collecting_a_finished_task_again_changes_nothing(built, job):
 
 def test_too_little_free_space_raises_error_before_collection(job, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=5_000))
-    message = rf"^{job.folder}: the disk is full: this task needs [\d,]{{6,}} bytes, 5,000 are free; .* another --out$"
+    message = rf"^{job.folder}: the disk is full: this task needs [\d,]{{6,}} bytes, but only 5,000 are free; .* --out$"
     with pytest.raises(DiskFullError, match=message):
-        job.run(never)
+        job.run(forbidden)
     assert not [path for path in tmp_path.iterdir() if not path.name.endswith(".lock")]
 
 
@@ -172,7 +172,7 @@ def test_disk_space_of_arrays_is_allocated_in_advance(job, tmp_path):
 
 def test_failed_allocation_of_arrays_leaves_no_files(job):
     with file_size_limit(64 * 1024), pytest.raises(DiskFullError, match=r": the disk is full: this task needs "):
-        job.run(never)
+        job.run(forbidden)
     assert not partial_folder(job.folder).exists()
 
 

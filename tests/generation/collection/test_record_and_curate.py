@@ -52,7 +52,7 @@ def random_rollouts(length: int, updates: int) -> list[Rollout]:
 
 
 def record_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
-    """Record step by step: the first 100 of each 400 steps, and the state after the 100 steps."""
+    """Record the first 100 of each 400 steps, and the state after them, in a loop over steps."""
     kept = empty_histories(config)
     for update, rollout in enumerate(rollouts):
         for t in range(config.rollout):
@@ -120,7 +120,7 @@ def score_by_hand(curve: list[int]) -> float:
 @pytest.mark.parametrize("episodes", [5, 12, 40, 59, 60, 146])
 def test_best_streams_have_the_highest_end_plus_improvement(episodes):
     rng = np.random.default_rng(episodes)
-    returns = (rng.integers(-20, 80, (30, episodes)) * 5).tolist()  # some exceed int8
+    returns = (rng.integers(-20, 80, (30, episodes)) * 5).tolist()  # some returns exceed the range of int8
     scores = [score_by_hand(curve) for curve in returns]
     assert len(set(scores)) > 20
     expected = sorted(range(30), key=lambda n: -scores[n])
@@ -129,7 +129,7 @@ def test_best_streams_have_the_highest_end_plus_improvement(episodes):
 
 
 def test_streams_with_equal_scores_are_ordered_by_number():
-    low, high, also_high = [0] * 10, [0] * 5 + [20] * 5, [10] * 5 + [25] * 5  # scores 0, 40 and 40
+    low, high, also_high = [0] * 10, [0] * 5 + [20] * 5, [10] * 5 + [25] * 5  # with scores 0, 40 and 40
     curves = [low, high, low, also_high, high, low]
     assert best_of(curves, 6) == [1, 3, 4, 0, 2, 5]
     assert best_of(curves, 2) == [1, 3]
@@ -145,13 +145,13 @@ def learner(*improvements: int) -> np.ndarray:
     ("learners", "keep", "expected"),
     [
         ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 4, [[1, 2], [1, 2]]),
-        ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 3, [[1, 2], [1]]),  # 30 is more than 25
+        ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 3, [[1, 2], [1]]),  # improvement 30 exceeds 25
         ([learner(10, 20), learner(90, 80, 70, 60)], 3, [[1], [0, 1]]),
         (
             [learner(30, 20, 40, 50), learner(0, 5, 4, 0)],
             4,
             [[3, 2, 0], [1]],
-        ),  # only one of the second learner improves by 5
+        ),  # only one stream of the second learner improves by 5
         ([learner(30, 20, 40, 50), learner(0, 0)], 8, [[3, 2, 0, 1], []]),
         ([learner(0), learner(0)], 2, [[], []]),
         ([learner(9), learner(7), learner(8)], 2, [[0], [], [0]]),
@@ -162,7 +162,7 @@ def test_selected_streams_are_divided_among_learners(learners, keep, expected):
 
 
 @pytest.fixture(scope="module")
-def labelled():
+def labels_and_logits():
     """Return labels of two streams of two episodes, and logits with the memory reset by episode, by step, or never."""
     widths = Widths(pointwise=(8,), spatial=(8,), dense=32, gru=16, head=16)
     network = ActorCritic(widths)
@@ -171,12 +171,12 @@ def labelled():
     obs = observe(LAYOUT, states, EGO)
     tree = jax.eval_shape(lambda key: network.untrained(key, LAYOUT.channels), jax.random.key(0))
 
-    def random(weight) -> np.ndarray:  # makes actions vary with states
+    def random_weight(weight) -> np.ndarray:  # random weights make actions vary with states
         if len(weight.shape) == 1:
             return np.zeros(weight.shape, np.float32)
         return (rng.normal(size=weight.shape) * 2 / np.prod(weight.shape[:-1]) ** 0.5).astype(np.float32)
 
-    params = jax.tree.map(random, tree)
+    params = jax.tree.map(random_weight, tree)
     params["params"]["encoder"]["LayerNorm_0"]["scale"] += 1
     step = jax.jit(network.apply)
 
@@ -195,8 +195,8 @@ def labelled():
     return labels, {name: logits_with_memory_from(starts) for name, starts in ways.items()}
 
 
-def test_labels_are_greedy_actions_with_the_memory_of_the_episode(labelled):
-    labels, logits = labelled
+def test_labels_are_greedy_actions_with_the_memory_of_the_episode(labels_and_logits):
+    labels, logits = labels_and_logits
     assert [(label.shape, label.dtype) for label in labels] == [((200,), np.int8)] * 2
     chosen = np.take_along_axis(logits["episode"], np.stack(labels)[..., None].astype(int), axis=-1)[..., 0]
     # Sums in another order round differently, so any action within rounding of the best one is a correct label.
@@ -204,9 +204,9 @@ def test_labels_are_greedy_actions_with_the_memory_of_the_episode(labelled):
     assert len(np.unique(labels)) > 2
 
 
-def test_labels_depend_on_memory_within_an_episode(labelled):
+def test_labels_depend_on_memory_within_an_episode(labels_and_logits):
     """Labels differ from actions with the memory reset at every step, or carried into the next episode."""
-    labels, logits = labelled
+    labels, logits = labels_and_logits
     without, across = (logits[way].argmax(axis=-1) for way in ("step", "never"))
     assert (np.stack(labels) != without).mean() > 0.1
     assert (np.stack(labels)[:, 100:] != across[:, 100:]).any()

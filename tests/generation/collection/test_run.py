@@ -119,7 +119,7 @@ def test_two_ray_workers_collect_bit_equal_tasks(built, pair, tmp_path):
 
 def test_number_of_workers_for_an_existing_ray_cluster_raises_error(tmp_path):
     jobs = [FileJob(tmp_path, "one")]
-    with pytest.raises(OptionError, match="workers = 2: the Ray at there:6379 sets its own number"):
+    with pytest.raises(OptionError, match="workers = 2: the Ray cluster at there:6379 sets the number"):
         run_jobs(jobs, tmp_path, Console(), QueueOptions(executor="ray", address="there:6379", workers=2))
 
 

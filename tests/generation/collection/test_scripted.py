@@ -1,4 +1,4 @@
-"""Histories that scripted egos play: actions, noise, labels, and independence of the batches of episodes."""
+"""Histories played by scripted egos: actions, noise, labels, and results that do not depend on the batch size."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ MATE = heuristic_teammate("utility_greedy", "default", 0)
 WORK = Work(make_task("teammate", "train", "demo_wide", MATE, 7), "noise")
 
 
-pytestmark = pytest.mark.usefixtures("short_pieces")
+pytestmark = pytest.mark.usefixtures("small_batches")
 
 
 @pytest.fixture(scope="module")
-def short_pieces():
+def small_batches():
     """Play the 40 episodes of a task in three batches of 16; the last batch is half filled."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scripted_rollout, "EPISODES_AT_ONCE", PIECE)
@@ -58,7 +58,7 @@ def profile(tmp_path_factory) -> Profile:
 
 
 @pytest.fixture(scope="module")
-def noise_artefact(profile, short_pieces, tmp_path_factory) -> Path:
+def noise_artefact(profile, small_batches, tmp_path_factory) -> Path:
     """Return the folder of a collected task with noise histories."""
     job = CollectionJob(WORK, profile, tmp_path_factory.mktemp("noise"))
     job.run()
@@ -109,7 +109,7 @@ def test_actions_equal_oracle_actions_except_for_noise(arrays):
     expected = 1 - arrays["noise"].reshape(40, 1) * 5 / 6
     assert clean[expected[:, 0] == 1].all()
     assert abs(clean.mean() - expected.mean()) < 4 * np.sqrt((expected * (1 - expected)).sum() / 40 / 4000)
-    noisy = arrays["actions"].reshape(40, 100)[~clean]  # all of them are random actions
+    noisy = arrays["actions"].reshape(40, 100)[~clean]  # these actions are all random
     assert (np.bincount(noisy, minlength=6) > 0.1 * len(noisy)).all()
 
 
@@ -119,10 +119,10 @@ def test_labels_equal_oracle_labels_of_recorded_states_and_actions(arrays):
 
 
 def test_episode_depends_only_on_seed_history_and_episode_number(arrays):
-    """Episodes of several histories in one batch are equal to those of the task."""
+    """Episodes of several histories, played in one batch, equal the episodes of the collected task."""
     mate = build_teammate(None, MATE)
     history, episode = np.array([3, 1, *[0] * 14]), np.array([2, 9, *range(14)])
-    chances = np.concatenate([arrays["noise"], arrays["noise"]], axis=1)  # noise for episodes 10 to 13 too
+    chances = np.concatenate([arrays["noise"], arrays["noise"]], axis=1)  # episodes 10 to 13 reuse earlier noise
 
     def play(seed):
         return next(play_scripted_histories(LAYOUT, mate, seed, "noise", [(history, episode)], chances))[1]

@@ -35,7 +35,7 @@ def failures(out: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def tries(out: Path, *names: str) -> list[int]:
+def attempts(out: Path, *names: str) -> list[int]:
     """Return the number of attempts of each job."""
     return [len(path.read_text()) if (path := out / f"{name}.tries").exists() else 0 for name in names]
 
@@ -48,7 +48,7 @@ def test_failed_job_is_reported_and_other_jobs_finish(tmp_path):
     assert (line["task_id"], line["attempts"], line["error"]) == ("bad", 1, "ValueError: attempt 1")
     assert "Traceback" in line["traceback"]
     assert "finished" in run(jobs, tmp_path)
-    assert tries(tmp_path, "bad", "good") == [2, 1]
+    assert attempts(tmp_path, "bad", "good") == [2, 1]
     assert not failures(tmp_path)
 
 
@@ -56,14 +56,14 @@ def test_failed_jobs_are_retried(tmp_path):
     run([FileJob(tmp_path, "later", failures=2)], tmp_path, retries=2)
     with pytest.raises(FailedJobsError):
         run([FileJob(tmp_path, "bad", failures=9), FileJob(tmp_path, "good")], tmp_path, retries=2)
-    assert tries(tmp_path, "later", "bad", "good") == [3, 3, 1]
+    assert attempts(tmp_path, "later", "bad", "good") == [3, 3, 1]
     assert [line["attempts"] for line in failures(tmp_path)] == [3]
 
 
 def test_fail_fast_stops_at_the_first_failure(tmp_path):
     with pytest.raises(FailedJobsError, match=r"failed\.jsonl: stopped after the first failure: ValueError: attempt 1"):
         run([FileJob(tmp_path, "bad", failures=9), FileJob(tmp_path, "good")], tmp_path, fail_fast=True)
-    assert tries(tmp_path, "bad", "good") == [1, 0]
+    assert attempts(tmp_path, "bad", "good") == [1, 0]
     assert len(failures(tmp_path)) == 1
 
 

@@ -1,4 +1,4 @@
-"""Generated layouts: determined by family, seed and number, distinct under symmetry, and in disjoint splits."""
+"""Generated layouts: determined by family, seed and number, distinct up to symmetry, and split disjointly."""
 
 from __future__ import annotations
 
@@ -39,50 +39,50 @@ EVERY_FAMILY = pytest.mark.parametrize("family", LAYOUT_FAMILIES)
 
 
 @pytest.fixture(scope="module")
-def drawn() -> dict[str, list[Layout]]:
+def samples() -> dict[str, list[Layout]]:
     """Return 800 generated layouts of each family."""
     return {family: generate_layouts(family, 0, 800) for family in LAYOUT_FAMILIES}
 
 
-def content(layouts: list[Layout]) -> list[tuple]:
+def layout_fields(layouts: list[Layout]) -> list[tuple]:
     return [(one.name, one.alias, one.rows, one.recipes, one.indicates_delivery) for one in layouts]
 
 
 @EVERY_FAMILY
-def test_generated_layouts_have_the_stored_hash(family, drawn):
-    text = repr(content(drawn[family][:40]) + [split_of(one) for one in drawn[family][:40]])
+def test_generated_layouts_have_the_stored_hash(family, samples):
+    text = repr(layout_fields(samples[family][:40]) + [split_of(one) for one in samples[family][:40]])
     assert hashlib.sha256(text.encode()).hexdigest() == GOLDEN[family]
 
 
 @EVERY_FAMILY
-def test_first_generated_layouts_do_not_depend_on_the_count(family, drawn):
-    assert content(generate_layouts(family, 0, 30)) == content(drawn[family][:30])
-    assert [one.rows for one in generate_layouts(family, 1, 5)] != [one.rows for one in drawn[family][:5]]
+def test_first_generated_layouts_do_not_depend_on_the_count(family, samples):
+    assert layout_fields(generate_layouts(family, 0, 30)) == layout_fields(samples[family][:30])
+    assert [one.rows for one in generate_layouts(family, 1, 5)] != [one.rows for one in samples[family][:5]]
     assert generate_layouts(family, 0, 0) == []
 
 
 @EVERY_FAMILY
-def test_generated_layout_is_found_by_its_name(family, drawn):
-    assert content([find_generated(f"{family}-0-7")]) == content(drawn[family][7:8])
+def test_generated_layout_is_found_by_its_name(family, samples):
+    assert layout_fields([find_generated(f"{family}-0-7")]) == layout_fields(samples[family][7:8])
 
 
 @EVERY_FAMILY
-def test_no_two_layouts_are_equal_under_symmetry(family, drawn):
-    maps = [canonical_map(get_layout(name)) for name in LAYOUT_NAMES] + [canonical_map(one) for one in drawn[family]]
+def test_no_two_layouts_are_equal_up_to_symmetry(family, samples):
+    maps = [canonical_map(get_layout(name)) for name in LAYOUT_NAMES] + [canonical_map(one) for one in samples[family]]
     assert len(set(maps)) == len(maps)
 
 
 @EVERY_FAMILY
-def test_every_generated_layout_is_solvable(family, drawn):
-    for layout in drawn[family]:
+def test_every_generated_layout_is_solvable(family, samples):
+    for layout in samples[family]:
         check_solvable(layout)
 
 
 @pytest.mark.parametrize("family", ["templates", "rooms"])
-def test_generated_layouts_have_allowed_fixtures_and_recipes(family, drawn):
+def test_generated_layouts_have_allowed_fixtures_and_recipes(family, samples):
     """Agents can face all fixtures; a layout has 4 to 6 fixtures more than needed, or fewer if there is no space."""
     shown = set()
-    for layout in drawn[family]:
+    for layout in samples[family]:
         grid, types = grid_of(layout), layout.ingredients
         faced = np.logical_or(*faced_cells(agent_rooms(layout)))
         assert faced[(grid != "W") & (grid != " ") & (grid != "A")].all()
@@ -96,17 +96,17 @@ def test_generated_layouts_have_allowed_fixtures_and_recipes(family, drawn):
     assert len(shown) == 8, "with and without recipe indicators, buttons and the delivery indicator"
 
 
-def test_layouts_of_family_rooms_are_small_and_a_third_separates_agents(drawn):
+def test_layouts_of_family_rooms_are_small_and_a_third_separates_agents(samples):
     published = published_rooms(False) | published_rooms(True)
     assert len(published) == 7  # some layouts, such as coord_simple and test_simple, have equal floor
-    for layout in drawn["rooms"]:
+    for layout in samples["rooms"]:
         assert layout.height <= MOST_ROWS and layout.width <= MOST_COLUMNS
-    shared = [np.array_equal(*layout.rooms) for layout in drawn["rooms"][:300]]
+    shared = [np.array_equal(*layout.rooms) for layout in samples["rooms"][:300]]
     assert shared == [True, False, True] * 100
 
 
-def test_symmetric_layouts_have_equal_canonical_map_and_split(drawn):
-    for layout in (get_layout("asymm_both"), get_layout("cramped_up"), *drawn["rooms"][:20], *drawn["templates"][:20]):
+def test_symmetric_layouts_have_equal_canonical_map_and_split(samples):
+    for layout in (*map(get_layout, ("asymm_both", "cramped_up")), *samples["rooms"][:20], *samples["templates"][:20]):
         images = [
             Layout("", "", tuple(map("".join, grid)), layout.recipes) for grid in symmetric_images(grid_of(layout))
         ]
@@ -123,8 +123,8 @@ def test_canonical_map_depends_on_start_rooms_but_not_start_cells():
     assert canonical_map(one_each) != canonical_map(other), "an agent starts in another room"
 
 
-def test_generated_layouts_are_split_by_declared_shares(drawn):
-    for family, layouts in drawn.items():
+def test_generated_layouts_are_split_by_declared_shares(samples):
+    for family, layouts in samples.items():
         splits = [split_of(one) for one in layouts]
         may_train = np.array([not has_tested_rooms(one) for one in layouts])
         assert not {"train"} & {split for split, may in zip(splits, may_train, strict=True) if not may}
@@ -132,16 +132,16 @@ def test_generated_layouts_are_split_by_declared_shares(drawn):
             trained = np.array(splits)[may_train] == split
             assert abs(trained.mean() - share) < 0.05
         some = generate_layouts(family, 0, 20, split="validation")
-        assert content(some) == content([one for one in layouts if split_of(one) == "validation"][:20])
+        assert layout_fields(some) == layout_fields([one for one in layouts if split_of(one) == "validation"][:20])
 
 
-def test_layouts_with_rooms_of_test_layouts_are_not_for_training(drawn):
+def test_layouts_with_rooms_of_test_layouts_are_not_for_training(samples):
     """Floor shapes of test layouts are excluded, except those that a training layout of the track layout has too."""
     assert {name for name in LAYOUT_NAMES if not has_tested_rooms(get_layout(name))} == {
         *TRACKS["layout"]["train"],
         *TRACKS["layout"]["test"],
     }
-    tested = [one for one in drawn["templates"] if has_tested_rooms(one)]
+    tested = [one for one in samples["templates"] if has_tested_rooms(one)]
     assert len(tested) == 400 and {split_of(one) for one in tested} == {"validation", "test"}
 
 
@@ -195,8 +195,8 @@ def test_layouts_command_lists_and_draws_layouts(tmp_path):
 
 
 @pytest.mark.slow
-def test_oracles_deliver_on_generated_layouts(drawn, monkeypatch):
-    monkeypatch.setattr(playable, "_AT_ONCE", 4)  # plays the layouts in two batches
+def test_oracles_deliver_on_generated_layouts(samples, monkeypatch):
+    monkeypatch.setattr(playable, "_AT_ONCE", 4)  # the layouts are played in two batches
     idle = Layout("idle", "idle", ("WWWWWW", "WA  WW", "WAW0PB", "WWWWXW"), recipes=((0, 0, 0),))
-    layouts = [one for family in LAYOUT_FAMILIES for one in drawn[family][:2]]
+    layouts = [one for family in LAYOUT_FAMILIES for one in samples[family][:2]]
     assert playable.layouts_delivered([*layouts, idle]).tolist() == [True] * len(layouts) + [False]

@@ -1,4 +1,4 @@
-"""Rearranged versions of layouts, which stored models were trained on."""
+"""Rearranged versions of layouts, on which stored models were trained."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TRAINING = TRACKS["layout"]["train"]
 
 
 def facing_counts(layout):
-    """Return how many fixtures of each map letter each set of agents can face."""
+    """Return the number of fixtures by map letter and by the set of agents that can face them."""
     found = Counter()
     for cell, letter in enumerate("".join(layout.rows)):
         x, y = cell % layout.width, cell // layout.width
@@ -57,7 +57,7 @@ def test_more_rearranged_layouts_than_exist_raise_error():
         rearranged_layouts(few, 36)
 
 
-def test_with_four_recipes_needs_two_ingredients():
+def test_layout_with_four_recipes_needs_two_ingredients():
     layout = with_four_recipes(get_layout("asymm_both"))
     assert layout.rows == get_layout("asymm_both").rows and len(layout.recipes) == 4
     one_ingredient = type(layout)("one", "one", ("WWWWW", "W0A0W", "WPBXW", "W0A W", "WWWWW"), recipes=((0, 0, 0),))

@@ -66,7 +66,7 @@ def test_unsolvable_layout_raises_error_with_the_reason(rows, recipes, reason):
         (("W01PWWWW", "WA PW AX", "WPWP  BW", "WWWWWWWW"), False),  # only the cooking agent reaches one of the pots
     ],
 )
-def test_needs_no_handover_if_scripted_experts_can_deliver(rows, easy):
+def test_needs_no_handover_tells_whether_scripted_experts_can_deliver(rows, easy):
     layout = make_layout(rows, MIXED)
     assert needs_no_handover(grid_of(layout), faced_cells(agent_rooms(layout)), MIXED) == easy
 

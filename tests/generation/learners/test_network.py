@@ -124,7 +124,7 @@ def test_outputs_and_gradients_equal_those_of_the_reference_network(which, reque
     names = plain_names(case.params, case.network.widths)
     weights = jax.random.normal(jax.random.key(4), (STEPS, ENVS, 7))
 
-    def both(network):
+    def with_gradients(network):
         """Return a function that computes the gradients of a weighted sum of all outputs, and the outputs."""
 
         def total(params, hidden):
@@ -134,8 +134,8 @@ def test_outputs_and_gradients_equal_those_of_the_reference_network(which, reque
 
         return jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))
 
-    (gradient, to_hidden), outputs = both(case.network)(case.params, case.hidden)
-    (plain_gradient, plain_to_hidden), plain_outputs = both(plain)(names, case.hidden)
+    (gradient, to_hidden), outputs = with_gradients(case.network)(case.params, case.hidden)
+    (plain_gradient, plain_to_hidden), plain_outputs = with_gradients(plain)(names, case.hidden)
     for found, expected in zip(outputs, plain_outputs, strict=True):
         assert found.shape == expected.shape
         assert_close(found, expected)

@@ -95,34 +95,34 @@ def lbrdiv() -> Updated:
 
 
 @pytest.fixture(params=[pytest.param("comedi", marks=pytest.mark.slow), "lbrdiv"])
-def either(request) -> Updated:
+def updated(request) -> Updated:
     return request.getfixturevalue(request.param)
 
 
-def test_population_update_depends_only_on_the_state(either):
-    assert same_bytes(either.update(either.before)[0], either.after)
-    other = either.update(either.before._replace(key=jax.random.key(77)))[0]
-    assert not same_bytes(other.params, either.after.params)
-    later = either.update(either.before._replace(update=jnp.int32(5)))[0]
-    assert not same_bytes(later.params, either.after.params)
+def test_population_update_depends_only_on_the_state(updated):
+    assert same_bytes(updated.update(updated.before)[0], updated.after)
+    other = updated.update(updated.before._replace(key=jax.random.key(77)))[0]
+    assert not same_bytes(other.params, updated.after.params)
+    later = updated.update(updated.before._replace(update=jnp.int32(5)))[0]
+    assert not same_bytes(later.params, updated.after.params)
 
 
-def test_population_update_changes_learning_policies_only(either):
-    learning = either.population.assignment.learning
-    for number in range(either.population.assignment.policies):
-        same = same_bytes(part(either.before.params, number), part(either.after.params, number))
+def test_population_update_changes_learning_policies_only(updated):
+    learning = updated.population.assignment.learning
+    for number in range(updated.population.assignment.policies):
+        same = same_bytes(part(updated.before.params, number), part(updated.after.params, number))
         assert same == (number >= learning)
 
 
-def test_metrics_separate_returns_of_self_play_and_cross_play(either):
-    assignment, done = either.population.assignment, np.asarray(either.rollout.done)
-    returns = np.asarray(either.rollout.returns)
+def test_metrics_separate_returns_of_self_play_and_cross_play(updated):
+    assignment, done = updated.population.assignment, np.asarray(updated.rollout.done)
+    returns = np.asarray(updated.rollout.returns)
     fresh, group = assignment.starts_from < 0, assignment.policy[0] % 2 == assignment.policy[1] % 2
     assert done[-1].all()
-    assert either.metrics["episodes"] == assignment.envs
-    np.testing.assert_allclose(either.metrics["self_play"], returns[-1][group & fresh].mean(), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(either.metrics["cross_play"], returns[-1][~group].mean(), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(either.metrics["shaping"], 1 - 96 / CONFIG.shaping_horizon, rtol=1e-6)
+    assert updated.metrics["episodes"] == assignment.envs
+    np.testing.assert_allclose(updated.metrics["self_play"], returns[-1][group & fresh].mean(), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(updated.metrics["cross_play"], returns[-1][~group].mean(), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(updated.metrics["shaping"], 1 - 96 / CONFIG.shaping_horizon, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -161,13 +161,13 @@ def test_shaped_rewards_are_ignored_in_slots_with_negative_weight(lbrdiv):
     shaped = np.random.default_rng(8).uniform(size=lbrdiv.rollout.shaped.shape).astype(np.float32)
 
     @jax.jit
-    def learned(shaped):
+    def learn_from(shaped):
         rollout = lbrdiv.rollout._replace(shaped=shaped)
         return trained._learn(before, trained._players(before.params), lbrdiv.carry, rollout, jax.random.key(1))[0]
 
-    params = learned(shaped)
-    assert same_bytes(params, learned(np.where(lowered, 0.0, shaped)))
-    assert not same_bytes(params, learned(np.where(lowered, shaped, 0.0)))
+    params = learn_from(shaped)
+    assert same_bytes(params, learn_from(np.where(lowered, 0.0, shaped)))
+    assert not same_bytes(params, learn_from(np.where(lowered, shaped, 0.0)))
 
 
 def test_lbrdiv_multipliers_follow_the_returns_of_the_environments(lbrdiv):

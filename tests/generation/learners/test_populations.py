@@ -92,7 +92,7 @@ def test_comedi_divides_environments_into_four_equal_kinds_of_play(environments)
 
 
 def test_comedi_rejects_environments_that_are_not_a_multiple_of_eight():
-    with pytest.raises(ValueError, match="environments = 12: CoMeDi needs a multiple of 8"):
+    with pytest.raises(ValueError, match="environments = 12: expected a multiple of 8 for CoMeDi"):
         CoMeDi().assignment(12)
 
 

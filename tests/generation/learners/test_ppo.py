@@ -54,18 +54,18 @@ PARAMS = {"turn": np.uint32(0)}
 """Parameters of the scripted teammate: a number of directions by which its moves are rotated."""
 
 
-class Diary(NamedTuple):
+class TeammateMemory(NamedTuple):
     """Memory of the scripted teammate."""
 
-    offset: jax.Array  # drawn by the episode's key
+    offset: jax.Array  # drawn with the episode's key
     steps: jax.Array  # number of steps taken in the episode
 
 
-def begin(params, key) -> Diary:
-    return Diary(jax.random.key_data(key)[1] % 4, jnp.uint32(0))
+def begin(params, key) -> TeammateMemory:
+    return TeammateMemory(jax.random.key_data(key)[1] % 4, jnp.uint32(0))
 
 
-def acts(params, memory: Diary, view, key):
+def scripted_act(params, memory: TeammateMemory, view, key):
     """Move in a direction that depends on the memory, the observation and the parameters."""
     action = (memory.offset + memory.steps + view.sum(dtype=jnp.uint32) + params["turn"]) % 4
     return action.astype(jnp.int32), memory._replace(steps=memory.steps + 1)
@@ -73,7 +73,7 @@ def acts(params, memory: Diary, view, key):
 
 @pytest.fixture(scope="module")
 def learner() -> Learner:
-    return Learner(Environment(CLOSET, max_steps=EPISODE), Policy(PARAMS, begin, acts, "observation"), CONFIG)
+    return Learner(Environment(CLOSET, max_steps=EPISODE), Policy(PARAMS, begin, scripted_act, "observation"), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ def set_counters(optimizer: Any, steps: int) -> Any:
 
 class Played(NamedTuple):
     before: list[LearnerState]
-    rollouts: list[Rollout]  # as NumPy arrays
+    rollouts: list[Rollout]  # the leaves are NumPy arrays
     metrics: list[dict[str, float]]
     after: LearnerState
 
@@ -120,7 +120,7 @@ def play(update: UpdateFunction, state: LearnerState, updates: int) -> Played:
 
 @pytest.fixture(scope="module")
 def played(update, frozen) -> Played:
-    """Return 40 updates from the state `frozen`, with roll-outs of the same policy."""
+    """Return 40 updates from the state `frozen`, in which the policy never changes."""
     return play(update, frozen, 40)
 
 
@@ -233,7 +233,7 @@ def test_ppo_update_depends_only_on_the_state(update, played):
     assert not same_bytes(other_state.carry.memories[EGO], once[0].carry.memories[EGO])
 
 
-def test_teammate_acts_by_the_parameters_in_the_state(update, frozen, played):
+def test_teammate_actions_depend_on_the_parameters_in_the_state(update, frozen, played):
     """The same compiled update can train with every teammate of a family."""
     state, rollout, _ = update(frozen._replace(teammate={"turn": jnp.uint32(1)}))
     first = played.rollouts[0].actions[0, :, TEAMMATE]
@@ -306,7 +306,7 @@ def rewarded_rollout() -> Rollout:
 
 def test_forgiveness_offsets_wrong_deliveries_while_rewards_are_shaped():
     """With forgiveness, shaping offsets the penalty of wrong deliveries for both agents, but not of button presses."""
-    slots = np.arange(4)  # both agents in both environments
+    slots = np.arange(4)  # one slot for each agent in each environment
     agents = np.repeat([EGO, TEAMMATE], 2)
     for weight, forgiven in ((1.0, 20), (0.25, 5), (0.0, 0)):
         found = sequences(

@@ -1,4 +1,4 @@
-"""Saved states, logs and folder locks of trainings."""
+"""Saved states, logs and folder locks of training runs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SETTINGS = {"ego": {"rate": 0.1, "layers": (1, 2)}, "seed": 3}
 
 
 def state() -> State:
-    """Return a pytree with every kind of leaf and node that the state of a training can have."""
+    """Return a pytree with every kind of leaf and node that a training state can have."""
     params = {"kernel": jnp.arange(6.0).reshape(2, 3).T, "empty": jnp.zeros((0, 4)), "nothing": ()}
     keys = {"one": jax.random.key(5), "many": jax.random.split(jax.random.key(3), 4)}
     record, ended = jnp.arange(256, dtype=jnp.uint8), jnp.array([True, False])

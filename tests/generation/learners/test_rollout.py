@@ -42,7 +42,7 @@ SLOTS = np.array([5, 0, 3, 6]), np.array([2, 7, 4, 1])
 NETWORK = ActorCritic(Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=8), partners=3)
 
 
-class Notes(NamedTuple):
+class ScriptMemory(NamedTuple):
     """Memory of a scripted player with M slots."""
 
     begun: jax.Array  # (M, S), state record at the start of the episode
@@ -50,12 +50,12 @@ class Notes(NamedTuple):
 
 
 def scripted(slots: np.ndarray) -> Player:
-    """Return a player that acts by its slot, the steps of the episode and the record at the episode's start."""
+    """Return a player whose actions depend on the slot, the step and the record at the start of the episode."""
 
-    def begin(state: EnvState) -> Notes:
-        return Notes(state.record[slots % ENVS], jnp.zeros(slots.size, jnp.int32))
+    def begin(state: EnvState) -> ScriptMemory:
+        return ScriptMemory(state.record[slots % ENVS], jnp.zeros(slots.size, jnp.int32))
 
-    def act(memory: Notes, state: EnvState, key):
+    def act(memory: ScriptMemory, state: EnvState, key):
         action = (slots + 2 * memory.steps + memory.begun.sum(axis=1, dtype=jnp.int32)) % len(ACTIONS)
         value = memory.steps.astype(jnp.float32)
         return Choice(jnp.asarray(action), jnp.full(slots.size, -1.0), value), memory._replace(steps=memory.steps + 1)
@@ -101,7 +101,7 @@ def played() -> Played:
 
 
 @pytest.fixture(scope="module")
-def restarted() -> Played:
+def played_with_hook() -> Played:
     return play(jax.jit(lambda carry, key: roll_out(ENV, PLAYERS, carry, STEPS, key, swap_positions)))
 
 
@@ -124,8 +124,8 @@ def apply():
     return jax.jit(apply)
 
 
-def in_state(record: np.ndarray) -> EnvState:
-    """Return environments with the given records after the first step of their first episode."""
+def env_state(record: np.ndarray) -> EnvState:
+    """Return the states of environments with the given records after the first step of their first episode."""
     clock = jnp.ones(len(record), jnp.int32)
     return EnvState(jax.random.split(jax.random.key(0), len(record)), 0 * clock, clock, jnp.asarray(record))
 
@@ -142,7 +142,7 @@ def test_actions_of_players_reach_their_agent_slots(played):
 
 
 def test_roll_out_equals_single_steps_of_the_environment(played):
-    """Compare with a loop over steps of the environment."""
+    """Compare a roll-out with a loop over steps of the environment."""
     step = jax.jit(ENV.step)
     state = played.start.env
     for t, actions in enumerate(played.rollout.actions):
@@ -211,19 +211,19 @@ def test_returns_add_up_rewards_of_an_episode_across_roll_outs(played):
     np.testing.assert_array_equal(after.returns, reward[15])
 
 
-def test_restart_hook_changes_only_first_states_of_episodes(played, restarted):
-    first, rollout = played.rollout.record, restarted.rollout
-    np.testing.assert_array_equal(rollout.record[:EPISODE], first[:EPISODE])  # no hook at the first start
+def test_restart_hook_changes_only_first_states_of_episodes(played, played_with_hook):
+    first, rollout = played.rollout.record, played_with_hook.rollout
+    np.testing.assert_array_equal(rollout.record[:EPISODE], first[:EPISODE])  # no hook call at the first start
     for start in (5, 10, 15):
         swapped_positions = first[start].copy()
         swapped_positions[:, :2] = first[start, :, 1::-1]
         np.testing.assert_array_equal(rollout.record[start], swapped_positions)
 
 
-def test_players_start_with_the_state_after_the_restart_hook(restarted):
-    np.testing.assert_array_equal(restarted.rollout.actions, expected_actions(restarted.rollout.record))
-    for notes, slots in zip(restarted.carry.memories, SLOTS, strict=True):
-        np.testing.assert_array_equal(notes.begun, restarted.rollout.record[15][slots % ENVS])
+def test_players_start_with_the_state_after_the_restart_hook(played_with_hook):
+    np.testing.assert_array_equal(played_with_hook.rollout.actions, expected_actions(played_with_hook.rollout.record))
+    for notes, slots in zip(played_with_hook.carry.memories, SLOTS, strict=True):
+        np.testing.assert_array_equal(notes.begun, played_with_hook.rollout.record[15][slots % ENVS])
 
 
 @pytest.mark.parametrize("greedy", [True, False])
@@ -233,7 +233,7 @@ def test_network_player_gives_the_outputs_of_its_network(params, apply, greedy):
     own = policy_params(params, 1)
     player = network_player(ENV, NETWORK, own, slots, partner, greedy)
     record = random_records(LAYOUT, ENVS, np.random.default_rng(3))
-    state = in_state(record)
+    state = env_state(record)
     hidden = jnp.asarray(np.random.default_rng(5).normal(size=(4, 8)), jnp.float32)
     np.testing.assert_array_equal(player.init(state), np.zeros((4, 8)))
     choice, after = jax.jit(player.act)(hidden, state, jax.random.key(6))
@@ -253,7 +253,7 @@ def test_player_of_several_policies_equals_separate_players(params):
     slots = np.array([[6, 1], [3, 4], [0, 7]])
     partner = jnp.array([[2, 0], [1, 1], [0, 2]])
     record = random_records(LAYOUT, ENVS, np.random.default_rng(3))
-    state = in_state(record)
+    state = env_state(record)
     hidden = jnp.asarray(np.random.default_rng(5).normal(size=(6, 8)), jnp.float32)
     together = network_player(ENV, NETWORK, params, slots, partner, greedy=True)
     np.testing.assert_array_equal(together.agent_slots, slots.ravel())
@@ -269,7 +269,7 @@ def test_player_of_several_policies_equals_separate_players(params):
 
 
 def test_policy_player_can_have_parameters_for_each_environment():
-    """The policy acts by its parameters and by the episode's key, which differs between environments."""
+    """Actions depend on the policy's parameters and on the episode's key, which differs between environments."""
 
     def draws(params, key):
         return jax.random.key_data(key)[1] % 5
@@ -279,7 +279,7 @@ def test_policy_player_can_have_parameters_for_each_environment():
     common = policy_player(ENV, policy, {"action": jnp.int32(3)}, EGO, ENVS)
     np.testing.assert_array_equal(own.agent_slots, np.arange(ENVS, 2 * ENVS))
     np.testing.assert_array_equal(common.agent_slots, np.arange(ENVS))
-    state = in_state(random_records(LAYOUT, ENVS, np.random.default_rng(7)))
+    state = env_state(random_records(LAYOUT, ENVS, np.random.default_rng(7)))
     for player, action, agent in ((own, np.arange(ENVS), TEAMMATE), (common, 3, EGO)):
         keys = jax.vmap(jax.random.fold_in)(ENV.episode_key(state), jnp.full(ENVS, agent))
         memory = np.asarray(jax.random.key_data(keys))[:, 1] % 5
@@ -292,7 +292,7 @@ def test_policy_player_receives_the_observation_of_its_agent():
         {}, lambda params, key: (), lambda params, memory, view, key: (view.sum(dtype=int), ()), "observation"
     )
     record = random_records(LAYOUT, ENVS, np.random.default_rng(11))
-    state = in_state(record)
+    state = env_state(record)
     sums = []
     for agent in (EGO, TEAMMATE):
         player = policy_player(ENV, policy, {}, agent, ENVS)

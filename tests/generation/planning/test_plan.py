@@ -61,7 +61,7 @@ def test_cost_of_noise_histories_needs_no_learners(tmp_path):
 def test_estimated_sizes_match_the_bundled_release():
     dataset = load_icrl4aht()
     shards = sum(path.stat().st_size for path in (dataset.root / "data").rglob("*.h5"))
-    made = [entry for entry in dataset.entries if entry.source != "agent"]  # others are few
+    made = [entry for entry in dataset.entries if entry.source != "agent"]  # few histories have source agent
     expected = sum(
         entry.T * plan.BYTES_PER_STEP["lite", str(entry.source)] + plan.BYTES_PER_HISTORY.get(str(entry.source), 0)
         for entry in made
@@ -73,7 +73,7 @@ def test_estimated_artefact_size_matches_stored_arrays(built):
     profile = load_profile(str(built / "tiny.toml"))
     arrays = sum(path.stat().st_size for path in artefact(built / "a").glob("*.npy"))
     egos = [(get_layout(name), profile.ego) for name in profile.layouts]
-    assert plan.artefact_bytes(egos) == arrays - 5 * 128  # without NumPy's headers
+    assert plan.artefact_bytes(egos) == arrays - 5 * 128  # NumPy's headers take 128 bytes each
 
 
 def test_plan_command_measures_speed_and_prints_costs(built):

@@ -22,7 +22,7 @@ LAYOUT = get_layout("cramped_up")
 STEPS = 6
 
 
-def count(params, key) -> jax.Array:
+def start_steps(params, key) -> jax.Array:
     return jnp.int32(0)
 
 
@@ -37,7 +37,7 @@ def act_by_state(params, steps, view, key):
 
 
 def policy(turn: int, act: Any = act_by_view) -> Policy:
-    return Policy({"turn": jnp.int32(turn)}, count, act, "state" if act is act_by_state else "observation")
+    return Policy({"turn": jnp.int32(turn)}, start_steps, act, "state" if act is act_by_state else "observation")
 
 
 POLICIES = [policy(0), policy(1, act_by_state), policy(0), policy(1)]
@@ -90,7 +90,7 @@ def test_family_distance_is_the_mean_over_pairs_of_policies():
 def test_only_identical_policies_have_distance_0(actions):
     distances = hamming_distances(actions)
     assert distances[0, 2] == 0
-    assert distances[0, 3] == 1  # its action is always the next one
+    assert distances[0, 3] == 1  # actions of policies 0 and 3 always differ
     assert 0 < distances[0, 1] < 1
 
 
@@ -99,7 +99,7 @@ def test_actions_on_common_states_use_teammate_observations_and_memory(records, 
     """Compare with expected actions: memory starts with each episode, and observations are the teammate's."""
     monkeypatch.setattr(build, "_visited_records", lambda env, numbers, family, key: records)
     found = actions_on_common_states(LAYOUT, [policy(2), policy(1, act_by_state)], steps=STEPS)
-    repeated = np.concatenate([records, records], axis=1)  # policies have two families
+    repeated = np.concatenate([records, records], axis=1)  # one copy for each of the two families
     seen = observe(LAYOUT, repeated, TEAMMATE).sum(axis=(2, 3, 4))
     expected = (2 + np.arange(STEPS)[:, None] + seen) % 6
     np.testing.assert_array_equal(found[0].reshape(seen.shape), expected)

@@ -109,7 +109,7 @@ def population(root: Path, algorithm: str) -> Path:
     return root / LAYOUT.name / algorithm
 
 
-def weights(folder: Path) -> dict[str, str]:
+def weight_hashes(folder: Path) -> dict[str, str]:
     """Return the file hash of every policy of a population, by path."""
     return {str(path.relative_to(folder)): file_hash(path) for path in sorted(folder.rglob(POLICY_WEIGHTS))}
 
@@ -123,7 +123,7 @@ def test_population_has_five_checkpoints_of_each_member(trained, algorithm):
     folder = population(trained(algorithm), algorithm)
     responses = ["m0", "m1"] if algorithm in ("brdiv", "lbrdiv") else []
     assert sorted(path.name for path in folder.glob("responses/*")) == responses
-    assert len(set(weights(folder).values())) == start + 10 + len(responses), "all policies differ"
+    assert len(set(weight_hashes(folder).values())) == start + 10 + len(responses), "all policies differ"
     assert job_of(algorithm, trained(algorithm)).is_finished()
     assert not list(folder.glob("resume*"))
 
@@ -179,7 +179,7 @@ class Stopped(Exception):
 
 @pytest.fixture
 def stopped(tmp_path, monkeypatch) -> Path:
-    """Return a suite with an LBRDiv training that was stopped in the last update, when multipliers have changed."""
+    """Return a suite with an LBRDiv training run, stopped in its last update, when multipliers have changed."""
 
     def stop(updates: int, speed: float) -> None:
         if updates == run_of("lbrdiv").updates:
@@ -195,7 +195,7 @@ def test_stopped_population_resumes_only_with_the_same_settings(trained, stopped
     before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
     with pytest.raises(
         OptionError,
-        match=r"lbrdiv.resume\.safetensors: saved by a training with other settings: seed was 0, now it is 1",
+        match=r"lbrdiv.resume\.safetensors: saved by a training run with other settings: seed was 0, now it is 1",
     ):
         PopulationJob(replace(run_of("lbrdiv"), seed=1), stopped).run()
     assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before
@@ -204,7 +204,7 @@ def test_stopped_population_resumes_only_with_the_same_settings(trained, stopped
     job_of("lbrdiv", stopped).run(lambda updates, speed: done.append(updates))
     assert done == [6]
     folders = [population(suite, "lbrdiv") for suite in (stopped, trained("lbrdiv"))]
-    assert weights(folders[0]) == weights(folders[1])
+    assert weight_hashes(folders[0]) == weight_hashes(folders[1])
     assert not compare_rebuilds(*folders).differences
 
 

@@ -1,4 +1,4 @@
-"""The smallest complete rebuilds: collected tasks, packaged releases, learned teammates, and invalid folders."""
+"""Tests of rebuilds of tiny profiles: collected tasks, packaged releases, learned teammates and invalid folders."""
 
 from __future__ import annotations
 
@@ -106,10 +106,10 @@ def test_rebuild_in_folder_with_other_files_raises_error(built, tmp_path):
 
 
 def test_rebuild_does_not_replace_release_of_another_profile(built, tmp_path, monkeypatch):
-    def never(*arguments):
+    def forbidden(*arguments):
         raise AssertionError("expected an error before any task is collected")
 
-    monkeypatch.setattr(build, "run_jobs", never)
+    monkeypatch.setattr(build, "run_jobs", forbidden)
     shutil.copytree(built / "a" / "lite", tmp_path / "lite")
     (tmp_path / "other.toml").write_text(TINY)
     with pytest.raises(
@@ -130,16 +130,16 @@ def test_bundle_release_replaces_the_bundled_release(built, monkeypatch, tmp_pat
 def no_distances():
     """Replace distances of learned teammates to the test teammates, which take most of a minute to compile."""
 
-    def numbered(layout, policies) -> list[NearestTest]:
+    def fake_nearest(layout, policies) -> list[NearestTest]:
         return [NearestTest("H4/t0", 0.5, number) for number, _ in enumerate(policies)]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(measures, "nearest_test", numbered)
+        patch.setattr(measures, "nearest_test", fake_nearest)
         yield
 
 
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory) -> Path:
+def learned_rebuild(tmp_path_factory) -> Path:
     """Return a rebuild with learned teammates, selected without a threshold for returns. Read only."""
     profile = tmp_path_factory.mktemp("learned") / "learned.toml"
     out = profile.parent / "out"
@@ -152,9 +152,9 @@ def learned(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_learned_teammates_of_a_release_reproduce_recorded_actions(learned):
+def test_learned_teammates_of_a_release_reproduce_recorded_actions(learned_rebuild):
     """On the observations of a recorded episode, a teammate restored from the release takes the recorded actions."""
-    dataset = load_icrl4aht(learned / "lite")
+    dataset = load_icrl4aht(learned_rebuild / "lite")
     assert [task.teammate_kind for task in dataset.entries[::3]] == ["fcp", "brdiv"]
     assert {entry.teammate_family for entry in dataset.entries} == {"rl"}
     layout = get_layout("demo_wide")
@@ -170,25 +170,25 @@ def test_learned_teammates_of_a_release_reproduce_recorded_actions(learned):
 
 
 @pytest.mark.slow
-def test_release_is_rebuilt_from_its_tasks_and_teammates(learned, tmp_path):
+def test_release_is_rebuilt_from_its_tasks_and_teammates(learned_rebuild, tmp_path):
     """The rebuild trains no populations, and its files have the same bytes."""
     profile = tmp_path / "learned.toml"
     profile.write_text(LEARNED)
-    given = ("--tasks", learned / "lite/meta/tasks.jsonl", "--suite", learned / "lite/teammates")
+    given = ("--tasks", learned_rebuild / "lite/meta/tasks.jsonl", "--suite", learned_rebuild / "lite/teammates")
     arguments = ["generate", "--profile", profile, "--out", tmp_path / "again", *given]
     run_cli(*[str(part) for part in arguments])
     assert not (tmp_path / "again/suite").exists()
-    compared = compare_rebuilds(learned / "lite", tmp_path / "again/lite")
+    compared = compare_rebuilds(learned_rebuild / "lite", tmp_path / "again/lite")
     assert not compared.differences
     assert compared.files > 10
 
 
 @pytest.mark.slow
-def test_verify_names_a_changed_teammate_of_a_release(learned, tmp_path):
+def test_verify_names_a_changed_teammate_of_a_release(learned_rebuild, tmp_path):
     root = tmp_path / "lite"
-    shutil.copytree(learned / "lite", root)
+    shutil.copytree(learned_rebuild / "lite", root)
     assert verify_release(root, level="deep").ok
-    assert verify_release(learned / "full", level="deep").ok
+    assert verify_release(learned_rebuild / "full", level="deep").ok
     weights = next(root.glob("teammates/**/policy.safetensors"))
     flip_bit(weights)
     write_manifest(root)
@@ -198,36 +198,34 @@ def test_verify_names_a_changed_teammate_of_a_release(learned, tmp_path):
 
 
 @pytest.mark.slow
-def test_verify_and_recover_report_missing_teammate_checkpoints(learned, tmp_path):
-    dataset = load_icrl4aht(learned / "lite")
+def test_verify_and_recover_report_missing_teammate_checkpoints(learned_rebuild, tmp_path):
+    dataset = load_icrl4aht(learned_rebuild / "lite")
     root = to_release(dataset, tmp_path / "lite", "lite")
     shutil.rmtree(root / "teammates")
     write_manifest(root)
     report = verify_release(root)
     assert report.ok
     assert any("2 tasks have learned teammates whose checkpoints" in note for note in report.notes)
-    with pytest.raises(
-        OptionError, match=r"checkpoint \w{64} is missing, which is the teammate of history 0; copy the checkpoint"
-    ):
+    with pytest.raises(OptionError, match=r"no checkpoint \w{64}, the teammate of history 0; copy the checkpoint"):
         recover_teammate(load_icrl4aht(root), 0)
 
 
 @pytest.mark.slow
-def test_repeated_rebuild_runs_no_job_again(learned, monkeypatch):
-    def never(*arguments):
+def test_repeated_rebuild_runs_no_job_again(learned_rebuild, monkeypatch):
+    def forbidden(*arguments):
         raise AssertionError("a finished job was run again")
 
     monkeypatch.setattr(select, "THRESHOLD", -np.inf)
-    monkeypatch.setattr(suite._PopulationTraining, "train", never)
-    monkeypatch.setitem(job._GENERATORS, "ppo", never)
-    assert rebuild(learned.parent / "learned.toml", learned).count("finished before") == 4
+    monkeypatch.setattr(suite._PopulationTraining, "train", forbidden)
+    monkeypatch.setitem(job._GENERATORS, "ppo", forbidden)
+    assert rebuild(learned_rebuild.parent / "learned.toml", learned_rebuild).count("finished before") == 4
 
 
 @pytest.mark.slow
-def test_rebuild_fails_if_all_teammates_are_below_the_threshold(learned, tmp_path):
-    shutil.copytree(learned / "suite", tmp_path / "suite")
+def test_rebuild_fails_if_all_teammates_are_below_the_threshold(learned_rebuild, tmp_path):
+    shutil.copytree(learned_rebuild / "suite", tmp_path / "suite")
     with pytest.raises(
         FailedJobsError, match=r"no checkpoint of fcp, brdiv exceeds the return of 20 .*raise teammates"
     ):
-        rebuild(learned.parent / "learned.toml", tmp_path)
+        rebuild(learned_rebuild.parent / "learned.toml", tmp_path)
     assert not (tmp_path / "lite").exists()

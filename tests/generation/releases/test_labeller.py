@@ -67,7 +67,7 @@ def task(built, tmp_path):
     profile = load_profile(str(built / "tiny.toml"))
     folder = tmp_path / "artefacts" / artefact(built / "a").name
     shutil.copytree(artefact(built / "a"), folder)
-    for kept in artefact(built / "a").parent.glob(".*.teammates.json"):  # measured facts about the teammate
+    for kept in artefact(built / "a").parent.glob(".*.teammates.json"):  # measured returns of the teammate
         shutil.copy(kept, folder.parent)
     return profile.units()[0].task, profile, folder
 
@@ -83,14 +83,14 @@ def measured(folder: Path) -> dict:
     return json.loads((folder / LABELLER_RETURNS).read_text())["measured"]
 
 
-def pack(task: tuple[Task, Profile, Path], target: Path, kind: Kind = "lite", **changes: Any) -> Path:
-    """Package the task into a release, with changes of the profile."""
+def package_task(task: tuple[Task, Profile, Path], target: Path, kind: Kind = "lite", **changes: Any) -> Path:
+    """Package the task into a release, with some settings of the profile changed."""
     chosen, profile, folder = task
     facts = teammate_facts([chosen], folder.parent, target)
     return package_release(folder.parent, target, [Work(chosen)], replace(profile, **changes), target, kind, facts)
 
 
-def never(*arguments):
+def forbidden(*arguments):
     raise AssertionError("returns were measured again")
 
 
@@ -101,8 +101,8 @@ def test_packaging_measures_every_checkpoint_once(task, tmp_path, monkeypatch):
         assert np.shape(found[way]) == (5, 200)
         assert (np.array(found[way]) % 5 == 0).all()  # rewards are multiples of 5
     assert len(np.unique(found["sampled"])) > 1
-    monkeypatch.setattr(labeller, "_measure", never)
-    pack(task, tmp_path / "full", "full")
+    monkeypatch.setattr(labeller, "_measure", forbidden)
+    package_task(task, tmp_path / "full", "full")
     assert is_task_finished(folder, Work(chosen), profile)
 
 
@@ -181,7 +181,7 @@ def test_index_provenance_and_card_describe_the_labeller(built):
 def test_clearly_better_earlier_checkpoint_labels_the_histories(task, tmp_path):
     chosen, _, folder = task
     with_returns(folder, [0, 60, 20, 5, 0])
-    root = pack(task, tmp_path / "lite")
+    root = package_task(task, tmp_path / "lite")
     dataset = load_icrl4aht(root)
     network, params, card = load_policy(folder / "checkpoints/c1")
     for history in dataset:
@@ -197,7 +197,7 @@ def test_clearly_better_earlier_checkpoint_labels_the_histories(task, tmp_path):
 @pytest.fixture
 def with_policies(task, tmp_path) -> Path:
     """Return a release that contains the labelling policies."""
-    return pack(task, tmp_path / "with", policies=True)
+    return package_task(task, tmp_path / "with", policies=True)
 
 
 def policy_files(root: Path) -> dict[str, str]:

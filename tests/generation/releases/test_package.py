@@ -1,4 +1,4 @@
-"""Packaging a release: selected streams, noise histories, labels, tasks that are left out, facts about teammates."""
+"""Packaging a release: selected streams, noise histories, labels, omitted tasks, and measurements of teammates."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def profile(built) -> Profile:
 def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequence[float], label: float) -> None:
     """Write the artefact of a learner whose first streams improve by `improvements` within ten episodes.
 
-    The last checkpoint earns `label` as a labeller.
+    Every checkpoint earns `label` in the measured greedy play.
     """
     folder = artefacts / work.name
     shutil.copytree(artefact(built / "a"), folder)
@@ -108,7 +108,7 @@ def test_improving_streams_of_both_learners_are_kept(two_learners, profile, tmp_
     assert made.filter.least_improvement == 5.0
     assert made.filter.before.return_end == pytest.approx((10 + 4 + 20 + 15 + 3 + 25) / 16, abs=1e-3)
     assert made.expert is not None
-    assert made.expert.return_greedy == 7.0  # the labeller is of the better learner
+    assert made.expert.return_greedy == 7.0  # the labeller is a checkpoint of the better learner
     for history in dataset:
         wanted = oracle_labels(LAYOUTS["demo_wide"], history.state[:], history.actions[:].astype(np.int8))
         assert history.entry.has_oracle_actions
@@ -215,7 +215,7 @@ def fake_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
     return [Draw(layout, family, base_seed, k, "H3/t1", distance, k, 0.0, 1.0, 30.0) for k in range(2)]
 
 
-def test_drawn_teammates_have_stored_facts_and_others_are_measured_once(tmp_path, monkeypatch):
+def test_drawn_teammates_use_stored_measurements_and_other_teammates_are_measured_once(tmp_path, monkeypatch):
     monkeypatch.setattr(draws_table, "read_draws", fake_draws)
     entry = sample_teammate("assembly_line", 1, "train")
     drawn = make_task("teammate", "train", "demo_wide", entry, 0)
@@ -261,7 +261,7 @@ def test_families_without_usable_draws_are_reported_with_the_reason(monkeypatch)
 
 
 @pytest.mark.slow
-def test_facts_of_a_preset_teammate_are_measured(tmp_path):
+def test_reference_returns_with_a_preset_teammate_are_measured(tmp_path):
     task = make_task("teammate", "train", "demo_wide", heuristic_teammate("utility_greedy", "default", 0), 0)
     facts = teammate_facts([task], tmp_path, tmp_path)[task.task_id]
     assert facts.matters

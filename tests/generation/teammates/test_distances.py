@@ -55,7 +55,7 @@ def test_common_states_of_unsupported_layout_raise_error():
         common_states(get_layout("asymm_both_plain"))
 
 
-def count(params, key) -> jax.Array:
+def start_steps(params, key) -> jax.Array:
     return jnp.int32(0)
 
 
@@ -65,31 +65,31 @@ def act_by_parameter(params, steps, view, key):
 
 
 def act_by_parameter_too(params, steps, view, key):
-    """Return the action that the parameter gives, like `act_by_parameter`, as a different function."""
+    """Return the action that the parameter gives (a second function, equal to `act_by_parameter`)."""
     return params, steps + 1
 
 
 def test_reference_returns_are_in_the_order_of_the_teammates(monkeypatch):
     """The reward is replaced by the ego's action (`stay` 4, oracle 1), plus 100 for the teammate's action 2."""
 
-    def counted(*arguments, **options) -> tuple[object, Rollout]:
+    def with_fake_rewards(*arguments, **options) -> tuple[object, Rollout]:
         carry, played = roll_out(*arguments, **options)
         actions = played.actions.astype(jnp.float32)
         return carry, played._replace(reward=actions[..., 0] + 100 * (actions[..., 1] == 2))
 
     roll_out = references.roll_out
-    other = Policy((), count, lambda params, steps, view, key: (jnp.int32(1), steps), "state")
-    monkeypatch.setattr(references, "roll_out", counted)
+    other = Policy((), start_steps, lambda params, steps, view, key: (jnp.int32(1), steps), "state")
+    monkeypatch.setattr(references, "roll_out", with_fake_rewards)
     monkeypatch.setitem(references.REFERENCE_EGOS, "oracle", other)
     monkeypatch.setattr(references, "KEPT_STEPS", 3)
     actions = {0: act_by_parameter, 2: act_by_parameter_too, 5: act_by_parameter}
-    mates = [Policy(jnp.int32(action), count, act, "state") for action, act in actions.items()]
+    mates = [Policy(jnp.int32(action), start_steps, act, "state") for action, act in actions.items()]
     found = reference_returns(LAYOUT, mates, episodes=2)
     stay, random, oracle = found.T
     np.testing.assert_array_equal(stay, [12, 312, 12])
     np.testing.assert_array_equal(oracle, [3, 303, 3])
     assert found.dtype == np.float64
-    np.testing.assert_array_equal(random - random[0], [0, 300, 0])  # equal random actions
+    np.testing.assert_array_equal(random - random[0], [0, 300, 0])  # the random ego's actions are equal
     assert 0 < random[0] < 15
     np.testing.assert_array_equal(reference_returns(LAYOUT, mates[1:], episodes=2), found[1:])
 

@@ -48,7 +48,7 @@ def chosen(*arguments, **options) -> list[tuple[str, int]]:
     return [(found.family, found.theta_id) for _, found in drawn_teammates("demo_wide", *arguments, **options)]
 
 
-def number_of(found: Draw) -> tuple[str, str, int, int]:
+def draw_key(found: Draw) -> tuple[str, str, int, int]:
     return found.layout, found.family, found.base_seed, found.theta_id
 
 
@@ -60,9 +60,9 @@ def test_draws_table_has_every_draw_once():
         for seed, count in DRAWS_PER_SEED.items()
         for theta_id in range(count)
     ]
-    assert [number_of(found) for found in read_measured(DRAWS_TABLE, Draw)] == expected
+    assert [draw_key(found) for found in read_measured(DRAWS_TABLE, Draw)] == expected
     assert [found.theta_id for found in read_draws("demo_wide", H1)] == list(range(DRAWS_PER_SEED[0]))
-    assert number_of(read_draws("demo_cook_wide", H1, 1)[3]) == ("demo_wide", H1, 1, 3)
+    assert draw_key(read_draws("demo_cook_wide", H1, 1)[3]) == ("demo_wide", H1, 1, 3)
 
 
 def test_draws_table_is_in_canonical_form(tmp_path):
@@ -168,7 +168,7 @@ def test_draws_similar_to_test_teammates_of_other_families_come_last(monkeypatch
     assert [theta_id for _, theta_id in chosen([H1], 3)] == [1, 2, 0]
 
 
-def test_draws_without_headroom_are_left_out_if_others_have_headroom(monkeypatch, tmp_path):
+def test_draws_without_headroom_are_left_out_if_other_draws_have_headroom(monkeypatch, tmp_path):
     flat, wide = draw(H1, 0, oracle=5.9), draw(H1, 1, oracle=6.0)
     use_table(monkeypatch, tmp_path, flat, wide, draw(H3, 0, oracle=5.9))
     assert chosen([H1], 1) == [(H1, 1)]

@@ -86,7 +86,7 @@ def stacked(family: str, thetas: list[dict[str, Any]]) -> dict[str, np.ndarray]:
 
 @lru_cache
 def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.ndarray]:
-    """Return actions (100, 5, N) and returns (5, N) of t0..t4 as agent 1 with an ego that stays and published noise.
+    """Return actions (100, 5, N) and returns (5, N) of t0..t4 as agent 1, with published noise and an ego that stays.
 
     The last episode starts from the published state and has a constant recipe.
     """
@@ -306,7 +306,7 @@ CRAMPED_CASES = [
     (H3, RUNNER | {"handoff_style": 2}, FULL, "0 210 32- right"),
 ]
 ASYMM_CASES = [
-    # H1 carries an ingredient to a pot that lacks this ingredient, or else to any pot.
+    # H1 carries an ingredient to a pot that needs this ingredient, or else to any pot.
     (H1, {}, {"recipe": MIXED, "pot_items": [0, 2 * ZERO]}, "1 530< 13- up, 1 531< 13- interact"),
     (H1, {}, {"pot_items": [0, ZERO]}, "1 531< 13- interact"),
     # An invading H2 takes no plate from its own side and wanders, unless several soups are ready.
@@ -367,10 +367,10 @@ def split_key(key: jax.Array, n: int) -> list[int]:
 @pytest.mark.parametrize(
     ("theta", "memory", "fields", "expected", "steps"),
     [
-        (SURE, {}, {}, "left", 1),  # walks to the button
-        (SURE | {"cost_sensitivity": 1.0}, {}, {}, "stay", 0),  # does not press; the key stays the same
-        ({"press_L_when_unknown": 0.0, "strict_recipe": 0.3}, {}, {}, "left", 0),  # guesses ingredient 0
-        ({"press_L_when_unknown": 0.0, "wrong_ingredient_prob": 1.0}, {}, {}, "left", 1),  # takes ingredient 0
+        (SURE, {}, {}, "left", 1),  # H1 walks to the button
+        (SURE | {"cost_sensitivity": 1.0}, {}, {}, "stay", 0),  # H1 does not press the button; its key stays the same
+        ({"press_L_when_unknown": 0.0, "strict_recipe": 0.3}, {}, {}, "left", 0),  # H1 guesses ingredient 0
+        ({"press_L_when_unknown": 0.0, "wrong_ingredient_prob": 1.0}, {}, {}, "left", 1),  # H1 takes ingredient 0
         (SURE | {"idle_prob": 1.0}, {}, {}, "stay", 1),
         (SURE, {"recipe": 3 * ZERO, "seen": 0, "clock": 100}, FULL, "stay", 1),
         (SURE, {"recipe": 3 * ZERO, "seen": 0, "clock": 101}, FULL, "left", 1),

@@ -67,7 +67,7 @@ def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.n
     return np.asarray(outputs[1], np.float64)
 
 
-def played(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
+def played_actions(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
     """Return actions (T, N) that a policy takes step by step in N environments with the given states."""
     player = policy_player(Environment(LAYOUT), policy, policy.params, slot, ENVS)
     act = jax.jit(player.act)
@@ -85,7 +85,7 @@ def test_greedy_action_is_the_likeliest_given_the_episodes_memory(tmp_path, slot
     params = save(tmp_path / "a", partners=4)
     record = states(STEPS, 2)
     logits = logits_of(params, 4, record, slot)
-    actions = played(learned.build_learned(LAYOUT, tmp_path / "a"), record, slot)
+    actions = played_actions(learned.build_learned(LAYOUT, tmp_path / "a"), record, slot)
     np.testing.assert_array_equal(actions, logits.argmax(axis=-1))
     assert len(np.unique(actions)) > 1
 

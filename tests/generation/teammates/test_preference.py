@@ -26,7 +26,7 @@ def test_manifests_contain_the_preference_tasks(split_tasks):
 
 
 def test_preference_splits_share_no_teammates_and_hold_out_layouts_and_recipes(split_tasks):
-    """Training has no test teammates, no layout of half of the test tasks, and only seven of ten recipes."""
+    """Training tasks have no test teammate and seven of ten recipes; half of the test tasks are on other layouts."""
     layouts = {split: {task.layout_name for task in tasks} for split, tasks in split_tasks.items()}
     assert layouts["train"] == layouts["validation"] == set(PREFERENCE_LAYOUTS["train"])
     halves = Counter(task.layout_name in layouts["train"] for task in split_tasks["test"])

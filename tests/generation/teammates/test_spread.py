@@ -42,7 +42,7 @@ POINTS = np.array([0.0, 0.3, 0.35, 1.0, 0.05])
 DISTANCES = abs(POINTS[:, None] - POINTS)
 
 
-def mate(split: str, theta_id: int, oracle: float = 30.0) -> SpreadTeammate:
+def make_teammate(split: str, theta_id: int, oracle: float = 30.0) -> SpreadTeammate:
     theta = {"w_deliver": float(theta_id)}
     return SpreadTeammate(split, "utility_greedy", theta_id, theta, "H4/t0", 0.5, "H1/t2", 0.4, 0.25, 0.0, 1.0, oracle)
 
@@ -50,14 +50,14 @@ def mate(split: str, theta_id: int, oracle: float = 30.0) -> SpreadTeammate:
 @pytest.fixture
 def small_spread(monkeypatch) -> LayoutSpread:
     """Replace the shipped list by two training teammates and one validation teammate on demo_wide."""
-    chosen = (mate("train", 3), mate("validation", 7), mate("train", 1))
+    chosen = (make_teammate("train", 3), make_teammate("validation", 7), make_teammate("train", 1))
     spread = LayoutSpread("demo_wide", 9, 6, 5, chosen)
     monkeypatch.setattr(module, "_bundled_spreads", lambda: {"demo_wide": spread})
     return spread
 
 
 def test_the_farthest_candidate_is_chosen_next():
-    """Of points on a line, both ends are chosen first, then the middle; 0.05 is too near to 0."""
+    """On a line, both end points are chosen first, then the middle; the point 0.05 is too near to the point 0."""
     assert choose_spread(DISTANCES, 0.1, 9) == ([0, 3, 2], [1.0, 1.0, pytest.approx(0.35)])
     assert choose_spread(DISTANCES, 0.04, 9)[0] == [0, 3, 2, 4, 1]
     assert choose_spread(DISTANCES, 0.05, 2)[0] == [0, 3]
@@ -69,7 +69,7 @@ def test_spread_candidates_are_distinct_and_valid():
     found = spread_candidates()
     assert {entry["base_seed"] for entry in found} == {SPREAD_SEED}
     assert len({(entry["family"], entry["theta_id"]) for entry in found}) == len(found)
-    assert all(0 <= entry["theta_id"] < 500 for entry in found)  # more would give equal seeds of tasks
+    assert all(0 <= entry["theta_id"] < 500 for entry in found)  # larger ids would give tasks equal seeds
     assert {entry["family"] for entry in found} == set(HEURISTIC_FAMILIES)
     assert teammate_id(WATCHER) in {teammate_id(entry) for entry in found}
     for entry in found:
@@ -184,7 +184,7 @@ def test_teammate_acts_randomly_with_the_given_probability():
     half, whole = (actions_of({"a": 0.5, RANDOM_ACTIONS: chance}) for chance in (0.5, 1.0))
     assert abs((half != 5).mean() - 0.5 * 5 / 6) < 0.08
     assert all(abs((whole == action).mean() - 1 / 6) < 0.07 for action in range(6))
-    np.testing.assert_array_equal(half[half != 5], whole[half != 5])  # with equal random numbers
+    np.testing.assert_array_equal(half[half != 5], whole[half != 5])  # both use equal random numbers
 
 
 def test_random_actions_with_fixed_noise_repeat_in_every_episode():

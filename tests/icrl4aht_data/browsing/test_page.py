@@ -36,7 +36,7 @@ from tests.helpers.states import random_records
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
-    """Return a release on two layouts, with two teammates on each, with expert and oracle actions."""
+    """Return a release on two layouts with two teammates each, and with expert and oracle actions."""
     root = tmp_path_factory.mktemp("browse") / "release"
     sources = ("ppo", "noise", "ppo", "noise")
     random_release(root, oracle=True, sources=sources, episodes=8)
@@ -95,7 +95,7 @@ def test_page_of_thirty_bundled_histories_is_below_five_megabytes():
     shown, known = ({layout_title(one.name) for one in part.layouts} for part in (chosen, bundled))
     assert shown == known
     assert set(chosen.counts("source")) == set(bundled.counts("source"))
-    assert set(chosen.counts("teammate_kind")) > set(HEURISTIC_KINDS)  # heuristic and learned teammates
+    assert set(chosen.counts("teammate_kind")) > set(HEURISTIC_KINDS)  # some histories have learned teammates
     page = make_browser_page(chosen)
     assert len(page.html) < 5_000_000
     assert page.shown_episodes == page.episodes == chosen.column("episodes").sum()
@@ -187,7 +187,7 @@ class TestBrowseCommand:
         for _ in range(2):
             assert run_browse(release).startswith("browse.html: 12 of 12 histories")
         (tmp_path / "browse.html").write_text("<!doctype html>\n<html><title>mine</title>")
-        with pytest.raises(OptionError, match=r"browse\.html: exists; give another name, or replace it by --overwrite"):
+        with pytest.raises(OptionError, match=r"browse\.html: exists; give another name, or use --overwrite"):
             run_browse(release)
         assert (tmp_path / "browse.html").read_text().endswith("<title>mine</title>")
 

@@ -28,7 +28,7 @@ def release(tmp_path_factory) -> Path:
     return to_release(dataset.filter(task_id=dataset.entries[0].task_id), tmp_path_factory.mktemp("meta") / "r", "lite")
 
 
-def first(content: dict[str, Any]) -> dict[str, Any]:
+def first_value(content: dict[str, Any]) -> dict[str, Any]:
     return next(iter(content.values()))
 
 
@@ -39,29 +39,29 @@ def test_verify_accepts_the_undamaged_release(release):
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        (PROVENANCE, lambda c: first(c)["teammate"].update(kind="heuristic"), "Object contains unknown field `kind`"),
-        (PROVENANCE, lambda c: c.update(more=first(c)), "task 'more': has no history"),
+        (PROVENANCE, lambda c: first_value(c)["teammate"].update(kind="heuristic"), "contains unknown field `kind`"),
+        (PROVENANCE, lambda c: c.update(more=first_value(c)), "task 'more': has no history"),
         (PROVENANCE, lambda c: c.pop(next(iter(c))), "': missing"),
-        (PROVENANCE, lambda c: first(c).update(seed=77), "seed: expected the task's"),
-        (PROVENANCE, lambda c: first(c)["ego"].update(clip=0.3), "ego_hash: expected"),
+        (PROVENANCE, lambda c: first_value(c).update(seed=77), "seed: expected the task's"),
+        (PROVENANCE, lambda c: first_value(c)["ego"].update(clip=0.3), "ego_hash: expected"),
         (
             PROVENANCE,
-            lambda c: first(c).update(streams_recorded=17),
+            lambda c: first_value(c).update(streams_recorded=17),
             "streams_recorded: expected {total}, {environments} of each of 2 learners, found 17",
         ),
         (
             PROVENANCE,
-            lambda c: first(c).update(streams_kept=9999),
+            lambda c: first_value(c).update(streams_kept=9999),
             "streams_kept: expected at most the {recorded} recorded",
         ),
         (
             PROVENANCE,
-            lambda c: first(c)["filter"]["after"].update(return_end=9.0),
+            lambda c: first_value(c)["filter"]["after"].update(return_end=9.0),
             "filter.after.return_end: exp",
         ),
         (
             PROVENANCE,
-            lambda c: [names.__setitem__(0, "brdiv") for names in first(c)["suite"]["algorithms"].values()],
+            lambda c: [names.__setitem__(0, "brdiv") for names in first_value(c)["suite"]["algorithms"].values()],
             "but the teammate is of fcp",
         ),
         (HISTORIES, lambda c: c[-1].update(env_idx=-1), "Expected `int` >= 0"),
@@ -73,7 +73,7 @@ def test_verify_accepts_the_undamaged_release(release):
         (HISTORIES, lambda c: c[-1].update(source="human"), "source: expected 'human' as in the index, found 'ppo'"),
         (HISTORIES, lambda c: [line.update(teammate_kind="territory") for line in c], "'territory' is of another fam"),
         (INFO, lambda c: c.update(data_version="../.."), "data version '../..': expected a SemVer version"),
-        (INFO, lambda c: first(c["statistics"]).update(disk_bytes=1), "statistics: expected"),
+        (INFO, lambda c: first_value(c["statistics"]).update(disk_bytes=1), "statistics: expected"),
     ],
 )
 def test_verify_finds_false_values_in_meta_files(release, tmp_path, name, change, message):
@@ -89,7 +89,7 @@ def test_verify_finds_false_values_in_meta_files(release, tmp_path, name, change
 
 def test_teammate_field_in_provenance_is_refused(release, tmp_path):
     """Regression: a teammate in provenance.json once replaced the teammate stored with the task."""
-    root = spoiled(release, tmp_path / "release", PROVENANCE, lambda c: first(c)["teammate"].update(family="brdiv"))
+    root = spoiled(release, tmp_path / "r", PROVENANCE, lambda c: first_value(c)["teammate"].update(family="brdiv"))
     with pytest.raises(IndexFormatError, match="unknown field `family`"):
         load_icrl4aht(root).recover_teammate(0)
 

@@ -46,7 +46,7 @@ class TestVerifyObservations:
 
     def test_deep_verification_finds_an_impossible_observation(self, published_folder, tmp_path):
         first = 2 * (7 + get_layout("demo_wide").ingredient_types)
-        # a wall in every cell
+        # the changed observation shows a wall in every cell
         root = write_damaged_history(published_folder, tmp_path, "obs", (33, slice(None), slice(None), first), 1)
         assert problems(root) == []
         (found,) = problems(root, level="deep")

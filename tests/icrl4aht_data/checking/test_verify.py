@@ -270,7 +270,7 @@ def update_metadata_rows(root):
 
 @pytest.mark.parametrize("heap", ["local", "global"])
 def test_verify_terminates_on_a_shard_with_a_cyclic_heap(damaged, heap):
-    """Regression: libhdf5 never returns from a free list or heap object that points to itself."""
+    """Regression: libhdf5 loops forever on a free list or heap object that points to itself."""
     path = damaged / SHARD
     if heap == "local":
         with h5py.File(path, "r+", libver="earliest") as file:

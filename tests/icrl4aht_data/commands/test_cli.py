@@ -37,7 +37,7 @@ def test_list_prints_one_row_per_task(lite):
     assert "coord_simple" not in text
 
 
-def test_show_prints_facts_of_a_release_or_a_history(lite):
+def test_show_describes_a_release_or_a_history(lite):
     release = json.loads(run_cli("show", "--json", lite[0]))
     assert (release["kind"], release["histories"], release["format_version"]) == ("lite", 12, FORMAT_VERSION)
     history = json.loads(run_cli("show", "--json", "--history", "7", lite[0]))
@@ -67,7 +67,7 @@ def test_list_and_show_print_sources_learners_and_labels(two_sources):
 
 @pytest.fixture
 def run_on_terminal(monkeypatch):
-    """Return a function that runs a command as on a terminal of 80 columns and returns the printed lines."""
+    """Return a function that runs a command on a simulated terminal of 80 columns and returns the printed lines."""
 
     def run(*arguments: str) -> list[str]:
         monkeypatch.setenv("COLUMNS", "80")

@@ -1,4 +1,4 @@
-"""Test cached sets of arrays: rebuilt on any mismatch, limited in size, with helpful errors."""
+"""Test that cached arrays are rebuilt on any mismatch and limited in size, and that errors name a remedy."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_cache_folder_that_is_a_file_raises_cache_error(tmp_path, monkeypatch, b
     assert path.read_bytes() == b""
 
 
-def test_read_only_cache_folder_serves_existing_arrays_but_takes_no_new_arrays(cache_folder):
+def test_read_only_cache_folder_returns_existing_arrays_and_refuses_new_arrays(cache_folder):
     assert_cached_values(cached_arrays(KEY, SIZE, write_arrays))
     cache_folder.chmod(0o555)
     (cache_folder / KEY).chmod(0o555)

@@ -114,9 +114,9 @@ def test_index_queries_match_a_scan_of_all_entries(long_release):
     ],
 )
 def test_error_names_the_number_of_an_invalid_index_line(read_changed_index, where, change, message):
-    def spoil_line(lines: list[str]) -> str:
+    def damage_line(lines: list[str]) -> str:
         bad = json.dumps(json.loads(lines[where]) | change)
         return "".join(f"{line}\n" for line in [*lines[:where], bad, *lines[where + 1 :]])
 
     with pytest.raises(IndexFormatError, match=rf"histories\.jsonl, line {where + 1}: .*({message})"):
-        read_changed_index(spoil_line)
+        read_changed_index(damage_line)

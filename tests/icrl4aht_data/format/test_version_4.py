@@ -40,7 +40,7 @@ def mixed_release(request, tmp_path_factory) -> tuple[Path, dict[int, dict[str, 
 
 
 @pytest.fixture(scope="module")
-def lite_mixed(tmp_path_factory) -> Path:
+def lite_release(tmp_path_factory) -> Path:
     """Return a small lite release with a noise task, a task of two PPO learners, and all provenance fields."""
     root = tmp_path_factory.mktemp("mixed") / "lite"
     options: dict[str, Any] = {"streams": 2, "episodes": 5, "oracle": True, "learners": 2, "sources": SOURCES[:2]}
@@ -77,13 +77,13 @@ def test_oracle_actions_learners_and_sources_round_trip(mixed_release):
     assert dataset.filter(source="noise").ids.tolist() == [0, 1, 10, 11]
 
 
-def test_deep_verification_lists_facts_it_cannot_check(mixed_release, lite_mixed):
+def test_deep_verification_lists_values_it_cannot_check(mixed_release, lite_release):
     report = verify_release(mixed_release[0], level="deep")
     assert report.ok, report.findings
     (note,) = report.notes
     assert note.startswith("oracle actions of 12 histories: only their range was checked")
     assert verify_release(mixed_release[0]).notes == []
-    report = verify_release(lite_mixed, level="deep")
+    report = verify_release(lite_release, level="deep")
     assert report.ok, report.findings
     assert [note.split(":")[0] for note in report.notes] == [
         "oracle actions of 6 histories",
@@ -93,9 +93,9 @@ def test_deep_verification_lists_facts_it_cannot_check(mixed_release, lite_mixed
     ]
 
 
-def test_published_files_omit_oracle_actions_and_learner_numbers(lite_mixed, tmp_path):
+def test_published_files_omit_oracle_actions_and_learner_numbers(lite_release, tmp_path):
     """Published files have no oracle actions, and number the streams of a task's learners consecutively."""
-    before = load_icrl4aht(lite_mixed)
+    before = load_icrl4aht(lite_release)
     to_published(before, tmp_path / "files")
     with h5py.File(tmp_path / "files" / "histories.h5") as file:
         assert all("oracle_actions" not in group and "expert_actions" in group for group in file.values())
@@ -105,7 +105,7 @@ def test_published_files_omit_oracle_actions_and_learner_numbers(lite_mixed, tmp
     after = load_icrl4aht(tmp_path / "back")
     expected = [entry.to_json() | {"has_oracle_actions": False} for entry in before.entries]
     assert [entry.to_json() for entry in after.entries] == expected
-    assert read_provenance(tmp_path / "back" / PROVENANCE) == read_provenance(lite_mixed / PROVENANCE)
+    assert read_provenance(tmp_path / "back" / PROVENANCE) == read_provenance(lite_release / PROVENANCE)
     with pytest.raises(LabelsMissingError, match=r"has no oracle actions: .* has_oracle_actions = false"):
         after[2].read("oracle_actions")
     np.testing.assert_array_equal(after[0].read("oracle_actions"), before[0].read("oracle_actions"))
@@ -129,25 +129,25 @@ def test_published_files_omit_oracle_actions_and_learner_numbers(lite_mixed, tmp
         (HISTORIES, lambda c: c[0].update(has_oracle_actions=False), "the index implies"),
         (
             PROVENANCE,
-            lambda c: last(c).update(streams_recorded=2),
+            lambda c: last_value(c).update(streams_recorded=2),
             "expected 4, 2 of each of 2 learners, found 2",
         ),
-        (PROVENANCE, lambda c: first(c)["noise"].update(episodes=6), "noise.episodes: expected the 5 of history 0"),
-        (PROVENANCE, lambda c: first(c)["noise"].update(end=[0.2, 0.1]), "noise.end: expected a range [least, most]"),
-        (PROVENANCE, lambda c: first(c)["nearest_test"].update(teammate="\x1b[2J"), "printable characters"),
-        (PROVENANCE, lambda c: first(c)["expert"].update(policy_sha256="0" * 64), "the script labels noise histories"),
+        (PROVENANCE, lambda c: first_value(c)["noise"].update(episodes=6), "noise.episodes: expected the 5 of history"),
+        (PROVENANCE, lambda c: first_value(c)["noise"].update(end=[0.2, 0.1]), "noise.end: expected a range [least"),
+        (PROVENANCE, lambda c: first_value(c)["nearest_test"].update(teammate="\x1b[2J"), "printable characters"),
+        (PROVENANCE, lambda c: first_value(c)["expert"].update(policy_sha256="0" * 64), "the script labels noise"),
     ],
 )
-def test_verify_finds_false_learners_sources_and_provenance(lite_mixed, tmp_path, name, change, message):
-    found = "\n".join(problems(spoiled(lite_mixed, tmp_path / "release", name, change), "deep"))
+def test_verify_finds_false_learners_sources_and_provenance(lite_release, tmp_path, name, change, message):
+    found = "\n".join(problems(spoiled(lite_release, tmp_path / "release", name, change), "deep"))
     assert message in found
 
 
-def first(content: dict[str, Any]) -> dict[str, Any]:
+def first_value(content: dict[str, Any]) -> dict[str, Any]:
     return next(iter(content.values()))
 
 
-def last(content: dict[str, Any]) -> dict[str, Any]:
+def last_value(content: dict[str, Any]) -> dict[str, Any]:
     return list(content.values())[-1]
 
 
@@ -183,12 +183,12 @@ def set_left_out(root: Path, *tasks: LeftOutTask) -> Path:
     return root
 
 
-def test_conversions_keep_left_out_tasks(lite_mixed, tmp_path):
+def test_conversions_keep_left_out_tasks(lite_release, tmp_path):
     other = replace(LEFT_OUT, layout="coord_simple", learners=0, streams=0, return_start=None, return_end=None)
-    root = set_left_out(shutil.copytree(lite_mixed, tmp_path / "a"), LEFT_OUT, other)
+    root = set_left_out(shutil.copytree(lite_release, tmp_path / "a"), LEFT_OUT, other)
     assert verify_release(root, level="deep").ok
     assert load_icrl4aht(root).info.left_out == [LEFT_OUT, other]
-    to_release(load_icrl4aht(root), tmp_path / "out", "full")  # conversion drops left-out tasks of other layouts
+    to_release(load_icrl4aht(root), tmp_path / "out", "full")  # left-out tasks on absent layouts are dropped
     assert read_info(tmp_path / "out").left_out == [other]
     random_release(tmp_path / "b", layouts=("demo_wide",), teammates=1, streams=1)
     made = load_icrl4aht(tmp_path / "b").entries[0].task_id
@@ -206,14 +206,14 @@ def test_conversions_keep_left_out_tasks(lite_mixed, tmp_path):
         ({"reason": "\x1b[2J"}, "printable characters"),
     ],
 )
-def test_invalid_left_out_tasks_are_refused(lite_mixed, tmp_path, change, message):
+def test_invalid_left_out_tasks_are_refused(lite_release, tmp_path, change, message):
     task = replace(LEFT_OUT, **change)
-    root = shutil.copytree(lite_mixed, tmp_path / "r")
+    root = shutil.copytree(lite_release, tmp_path / "r")
     with pytest.raises(IndexFormatError, match=message):
         read_info(set_left_out(root, task))
 
 
-def test_verify_finds_histories_of_a_left_out_task(lite_mixed, tmp_path):
-    task_id = load_icrl4aht(lite_mixed).entries[0].task_id
-    root = set_left_out(shutil.copytree(lite_mixed, tmp_path / "r"), replace(LEFT_OUT, task_id=task_id))
+def test_verify_finds_histories_of_a_left_out_task(lite_release, tmp_path):
+    task_id = load_icrl4aht(lite_release).entries[0].task_id
+    root = set_left_out(shutil.copytree(lite_release, tmp_path / "r"), replace(LEFT_OUT, task_id=task_id))
     assert f"left_out: task '{task_id}' has histories in the index" in "\n".join(problems(root))

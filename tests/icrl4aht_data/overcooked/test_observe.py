@@ -1,4 +1,4 @@
-"""Test observations of hand-drawn scenes, layouts, and the columns and faults of state records.
+"""Test layouts, observations of hand-drawn scenes, and columns and faults of state records.
 
 Most scenes use the layout cramped_up:
 
@@ -79,7 +79,7 @@ def nonzero_channels(layout: Layout, record: np.ndarray, agent: int) -> dict[str
     return found
 
 
-def cells_with(value: int, *cells: tuple[int, int]) -> Cells:
+def cell_values(value: int, *cells: tuple[int, int]) -> Cells:
     return dict.fromkeys(cells, value)
 
 
@@ -146,7 +146,7 @@ def test_a_possible_map_is_accepted():
 
 
 def test_observation_of_a_scene_has_the_expected_nonzero_channels():
-    """Check all nonzero channels; from (1, 1) the window covers x = -1..3, y = -1..3."""
+    """Check all nonzero channels. The agent at (1, 1) observes cells x = -1..3, y = -1..3."""
     record = state_record(
         CRAMPED,
         (1, 1, "left"),
@@ -158,25 +158,25 @@ def test_observation_of_a_scene_has_the_expected_nonzero_channels():
         counters={(1, 0): ONE, (0, 2): PLATE, (2, 3): PLATE + COOKED + 3 * ONE},
     )
     assert nonzero_channels(CRAMPED, record, 0) == {
-        "self position": cells_with(1, (1, 1)),
-        "self left": cells_with(1, (1, 1)),
-        "self 0": cells_with(1, (1, 1)),
-        "other position": cells_with(1, (3, 2)),
-        "other down": cells_with(1, (3, 2)),
-        "other plate": cells_with(1, (3, 2)),
-        "other cooked": cells_with(1, (3, 2)),
-        "other 0": cells_with(2, (3, 2)),
-        "other 1": cells_with(1, (3, 2)),
-        "wall": cells_with(1, (0, 0), (1, 0), (3, 0), (0, 2), (0, 3), (2, 3)),
-        "goal": cells_with(1, (3, 3)),
-        "pot": cells_with(1, (2, 0)),
-        "plates": cells_with(1, (1, 3)),
-        "pile 0": cells_with(1, (0, 1)),
-        "item plate": cells_with(1, (0, 2), (2, 3)),
-        "item cooked": cells_with(1, (2, 3)),
-        "item 0": cells_with(2, (2, 0)),
+        "self position": cell_values(1, (1, 1)),
+        "self left": cell_values(1, (1, 1)),
+        "self 0": cell_values(1, (1, 1)),
+        "other position": cell_values(1, (3, 2)),
+        "other down": cell_values(1, (3, 2)),
+        "other plate": cell_values(1, (3, 2)),
+        "other cooked": cell_values(1, (3, 2)),
+        "other 0": cell_values(2, (3, 2)),
+        "other 1": cell_values(1, (3, 2)),
+        "wall": cell_values(1, (0, 0), (1, 0), (3, 0), (0, 2), (0, 3), (2, 3)),
+        "goal": cell_values(1, (3, 3)),
+        "pot": cell_values(1, (2, 0)),
+        "plates": cell_values(1, (1, 3)),
+        "pile 0": cell_values(1, (0, 1)),
+        "item plate": cell_values(1, (0, 2), (2, 3)),
+        "item cooked": cell_values(1, (2, 3)),
+        "item 0": cell_values(2, (2, 0)),
         "item 1": {(1, 0): 1, (2, 0): 1, (2, 3): 3},
-        "pot timer": cells_with(13, (2, 0)),
+        "pot timer": cell_values(13, (2, 0)),
     }
 
 
@@ -192,7 +192,7 @@ def test_delivery_channel_marks_the_goal_for_one_step(layout, goal, poses, deliv
     assert "delivery" not in nonzero_channels(layout, record, deliverer)
     after = rules.step(layout, record, np.array([actions]), next_recipe)
     assert after.reward == 20
-    assert nonzero_channels(layout, after.state, deliverer)["delivery"] == cells_with(1, goal)
+    assert nonzero_channels(layout, after.state, deliverer)["delivery"] == cell_values(1, goal)
     assert "delivery" not in nonzero_channels(
         layout, after.state, 1 - deliverer
     )  # the goal is outside the other agent's window

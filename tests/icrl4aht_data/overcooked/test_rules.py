@@ -102,7 +102,7 @@ def test_action_ids_follow_the_order_of_the_paper():
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_agents_move_as_specified_from_every_pair_of_cells(layout):
-    """Compare with steps 1 to 3 of the specification, computed here for each cell."""
+    """Compare with steps 1 to 3 of the specification, recomputed here in plain Python."""
     cells, wanted_cells, actions = [], [], []
     starts = [pair for pair in product(*layout.rooms) if pair[0] != pair[1]]
     for old, pair in product(starts, product(range(6), repeat=2)):
@@ -178,7 +178,7 @@ def ring_scene(slot: int, hand: int = 0, **fields) -> np.ndarray:
 def test_button_press_costs_5_and_shows_the_recipe_for_9_observations(slot):
     record = ring_scene(slot, recipe=RECIPE_000)
     row = 3 if slot == 0 else 1
-    recipe_channel = 2 * 10 + 6 + 3 + 5 + 2  # count of ingredient 0 in the recipe, with three ingredient types
+    recipe_channel = 2 * 10 + 6 + 3 + 5 + 2  # channel of ingredient 0 of the recipe, for three ingredient types
     after = interact(slot, record, RING)
     assert (after.reward, after.shaped, after.hands) == (-5, [0, 0], [0, 0])
     timers, visible = [], []
@@ -231,7 +231,7 @@ AWAY = ((2, 3, "down"), (6, 3, "down"))  # the agents face the counters (2, 4) a
         ([0, 0], 0, {}, 0),  # no pot in use
         ([ZERO, 0], 0, {}, 3),
         ([0, SOUP_111], 0, {}, 3),
-        ([ZERO, 0], PLATE, {}, 0),  # hands hold as many plates as pots are in use
+        ([ZERO, 0], PLATE, {}, 0),  # the other agent holds a plate for the only pot in use
         ([ZERO, ONE], PLATE, {}, 3),
         ([ZERO, 0], DISH_000, {}, 3),  # a dish does not count as a plate
         ([ZERO, 0], 0, {(1, 4): PLATE}, 0),

@@ -118,7 +118,7 @@ def test_changes_during_copying_are_detected(damaged, tmp_path):
         if what == "copying" and done == total:
             (tmp_path / ".out.partial/meta/provenance.json").write_text("{}")
 
-    with pytest.raises(ReleaseError, match=r"provenance\.json: changed while it was copied, sha256 now"):
+    with pytest.raises(ReleaseError, match=r"provenance\.json: changed while it was copied; sha256 is now"):
         build_release(damaged, tmp_path / "out", advance=change_copied_file)
     assert not (tmp_path / "out").exists()
 

@@ -129,7 +129,7 @@ def test_repositories_with_foreign_files_are_refused(hub, published_release, tmp
 
 def test_a_public_repository_is_refused_for_a_private_upload(hub, published_release, tmp_path):
     upload_release(published_release, ADDRESS)
-    with pytest.raises(UploadError, match="us/histories: is a public repository; make it private"):
+    with pytest.raises(UploadError, match="us/histories is a public repository; make it private"):
         upload_release(next_version(published_release, tmp_path / "new"), ADDRESS, private=True)
 
 
@@ -151,12 +151,12 @@ def test_a_killed_upload_resumes(hub, published_release):
     """Kill an upload and repeat the command: completely uploaded files are not sent again."""
     puts = 0
 
-    def fault_rule(request: Request) -> Slow | None:
+    def delay_after_three_uploads(request: Request) -> Slow | None:
         nonlocal puts
         puts += request.method == "PUT"
         return Slow(60) if request.method == "PUT" and puts > 3 else None
 
-    hub.faults.add(fault_rule)
+    hub.faults.add(delay_after_three_uploads)
     command = [sys.executable, "-m", "icrl4aht_data", "upload", str(published_release), ADDRESS]
     process = subprocess.Popen(command, env=hub.environment | {"PATH": ""}, cwd=ROOT)
     deadline = time.monotonic() + 60
@@ -213,11 +213,11 @@ def test_repository_changed_during_the_upload_gets_no_tag(hub, published_release
     (tmp_path / "theirs/CITATION.cff").unlink()
     (tmp_path / "theirs/more.txt").write_text("")
 
-    def fault_rule(request: Request) -> None:
+    def commit_as_other_user(request: Request) -> None:
         if request.method == "GET" and request.path == f"/api/datasets/{REPO}":
             hub.add_repo(REPO, tmp_path / "theirs")
 
-    hub.faults.add(fault_rule)
+    hub.faults.add(commit_as_other_user)
     with pytest.raises(UploadError, match=r"differs from the release: more\.txt: not in the .*CITATION\.cff: missing"):
         upload_release(published_release, ADDRESS)
     assert not hub.repo(REPO).tags

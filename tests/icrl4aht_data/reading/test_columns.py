@@ -146,5 +146,5 @@ class TestWeakLabels:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             dataset.dpt(batch_size=2, context=5)
-        # the labels earn 9.5
+        # the expert labels of both histories earn a return of 9.5
         assert [one.category for one in caught] == [WeakLabelsWarning] * weak

@@ -83,14 +83,14 @@ class TestConversion:
 
 
 def assign(name: str, where: Any, value: Any):
-    def spoil(file: h5py.File, index: list[dict]) -> None:
+    def assign_value(file: h5py.File, index: list[dict]) -> None:
         dataset: Any = file[name]
         array = dataset[()].astype("f4")
         array[where] = value
         del file[name]
         file[name] = array
 
-    return spoil
+    return assign_value
 
 
 def delete(name: str):
@@ -200,7 +200,7 @@ class TestTasks:
             from_published(source, tmp_path / "out", kept_steps=KEPT)
 
 
-class TestWithoutStates:
+class TestMissingStates:
     def test_reading_missing_states_raises_errors(self, converted_release):
         with pytest.raises(
             OptionError, match=r'obs = "state": .* has observations only, no state records; use float32'
@@ -245,8 +245,8 @@ class TestBatches:
     def test_contexts_exclude_the_last_steps_of_episodes(
         self, converted_release, published_folder, cache, order, options
     ):
-        """Contexts exclude last steps, also of unfinished episodes, and contain all other steps."""
-        arrays = published_folder[1][1]  # 130 steps: six complete episodes and half an episode
+        """Contexts contain all steps except the last step of each episode, even if the episode is unfinished."""
+        arrays = published_folder[1][1]  # a history of 130 steps, which are six and a half episodes
         dataset = load_icrl4aht(converted_release, obs="uint8", cache=cache).select([1])
         sampler = dataset.dpt(batch_size=40, context=15, order=order, seed=2, teammate_actions=True, **options)
         low, high = {(1, 3): (20, 60), (-1, None): (100, 130)}.get(options.get("episodes"), (0, 130))

@@ -57,8 +57,8 @@ def test_second_loop_over_batches_continues_after_the_first(sampler, prefetch):
     assert_equal([*again, *again][3], sampler[3])
 
 
-def _aligned_like(array):
-    """Return an empty array of the same shape, with a memory alignment that JAX would alias instead of copying."""
+def _aligned_empty(array):
+    """Return an empty array like `array`, aligned so that JAX would alias its memory instead of copying it."""
     if array is None:
         return None
     memory = np.empty(array.nbytes + 64, np.uint8)
@@ -66,9 +66,9 @@ def _aligned_like(array):
     return memory[start : start + array.nbytes].view(array.dtype).reshape(array.shape)
 
 
-def test_batches_on_a_device_equal_the_samplers_batches(sampler, monkeypatch):
+def test_batches_on_a_device_equal_the_batches_of_the_sampler(sampler, monkeypatch):
     empty = sampler.empty
-    monkeypatch.setattr(sampler, "empty", lambda: type(empty())(*map(_aligned_like, empty())))
+    monkeypatch.setattr(sampler, "empty", lambda: type(empty())(*map(_aligned_empty, empty())))
     batches = list(sampler.batches(stop=5, device=jax.devices()[0]))
     for i, batch in enumerate(batches):
         assert isinstance(batch.obs, jax.Array)

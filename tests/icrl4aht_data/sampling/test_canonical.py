@@ -23,7 +23,7 @@ RELEASES = ["lite", "full", "reconverted_release"]
 
 @pytest.fixture(params=RELEASES)
 def root(request):
-    """Return releases of the same histories that store states, states and observations, or observations."""
+    """Return a release of the same histories with states, with states and observations, or with observations."""
     made = request.getfixturevalue(request.param)
     return made if request.param == "reconverted_release" else made[0]
 
@@ -32,7 +32,7 @@ def load_canonical(root, **options) -> Any:
     return load_icrl4aht(root, layout=LAYOUTS, channels="canonical", **{"obs": "uint8", "threads": 2} | options)
 
 
-def test_canonical_histories_have_stored_channels_and_zeros(root):
+def test_canonical_histories_have_stored_channels_and_zeros_elsewhere(root):
     dataset = load_canonical(root)
     own = dataset.with_options(channels="own")
     for number in (0, len(dataset) - 1):
@@ -53,7 +53,7 @@ def test_canonical_histories_have_stored_channels_and_zeros(root):
 def ad_and_dpt_samplers(dataset):
     return [
         dataset.ad(batch_size=8, length=50, seed=3),
-        dataset.ad(batch_size=6, length=130, seed=3),  # windows longer than the histories
+        dataset.ad(batch_size=6, length=130, seed=3),  # these windows are longer than the histories
         dataset.dpt(batch_size=8, context=17, seed=3),
         dataset.dpt(batch_size=8, context=17, seed=3, order="random"),
     ]

@@ -22,7 +22,7 @@ def next_step(step: int, every: int) -> int:
 
 
 def previous_step(step: int, every: int) -> int:
-    """Return the step before `step` in a window of every n-th episode; -1 before the first step."""
+    """Return the step before `step` in a window of every n-th episode, or -1 for the first step."""
     skipped = (every - 1) * LENGTH
     return step - 1 if step % LENGTH or step <= skipped else step - 1 - skipped
 

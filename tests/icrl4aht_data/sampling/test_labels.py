@@ -20,7 +20,7 @@ OPTIONS: dict[str, Any] = {"batch_size": 16, "context": 9, "seed": 4}
 
 
 def expected_targets(written, sampler, i: int) -> np.ndarray:
-    """Return the labels at the query steps of batch i."""
+    """Return the expert or oracle actions at the query steps of batch i."""
     query, steps, *_ = sampler._draw(i)
     ids = sampler.dataset.ids[query].tolist()
     return np.array([written[k][f"{sampler.labels}_actions"][t] for k, (t,) in zip(ids, steps, strict=True)])
@@ -121,7 +121,7 @@ class TestMissingLabels:
 
 
 def test_weak_oracle_labels_cause_a_warning(two_sources, monkeypatch):
-    """The oracle earns 5 in all tasks, less than half of the patched final returns of 11."""
+    """The oracle earns 5 in all tasks, and the test sets the final return of all histories to 11."""
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", source="ppo")
     column = type(dataset).column
 

@@ -191,7 +191,7 @@ def test_contexts_can_be_sampled_from_episodes_of_one_step(tmp_path):
 
 
 def test_batch_larger_than_free_memory_is_refused(lite):
-    """Regression: too large batches raised NumPy's MemoryError or killed the process."""
+    """Regression: batches larger than free memory raised NumPy's MemoryError or killed the process."""
     dataset, size = load_icrl4aht(lite[0], layout="demo_wide"), 10**13
     message = rf"batch_size = {size}, (length|context) = 100: .*: takes [\d,]+ GB of memory, more than is free: read"
     for sampler in (dataset.ad(batch_size=size, length=100), dataset.dpt(batch_size=size, context=100)):

@@ -1,4 +1,4 @@
-"""Test plugins registered by entry points: found by name, imported on demand, with clear errors."""
+"""Test that plugins of entry points are found by name, imported on demand, and raise clear errors if broken."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_broken_teammate_and_method_plugins_raise_errors(plugin_folder):
         for name, problem in {
             "three": "expected a Callable, found int: 3",
             "their_ad": "expected name 'their_ad' and data 'ad' or 'dpt', found name 'my_ad'",
-            "no_ad": "expected a function that returns a Method, it returned None",
+            "no_ad": "expected a function that returns a Method, found result None",
         }.items():
             with pytest.raises(PluginError, match=f"rooms 0.1, entry point icrl4aht.methods: {name} .*{problem}"):
                 get_method(name)(ModelOptions(), world)

@@ -1,4 +1,4 @@
-"""Test progress output: lines without a terminal, timed by a fake clock, and bars on terminals."""
+"""Test progress output: bars on terminals, and otherwise lines, which a fake clock times."""
 
 from __future__ import annotations
 

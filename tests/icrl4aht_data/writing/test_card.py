@@ -1,4 +1,4 @@
-"""Test the card of a release: its facts, README.md, and the long tables in card.json."""
+"""Test the card of a release: computed values, README.md, and the long tables in card.json."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def four_tasks() -> Tasks:
 
 @pytest.fixture
 def write_meta(lite, tmp_path) -> Callable[..., dict[str, Any]]:
-    """Return a function that writes meta/ and returns the facts of its card; `change` edits each provenance."""
+    """Return a function that writes meta/ and returns the values for the card; `change` edits each provenance."""
     like = read_index(lite[0]).entries[0]
 
     def write_meta(tasks: Tasks | None = None, change: Change = lambda of: of, **fields: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Test combining releases: equal histories, equal bytes and refused inputs."""
+"""Test that combining releases keeps all histories and refuses invalid inputs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FIELDS = ("state", "actions", "rewards", "dones", "teammate_actions", "expert_a
 
 
 @pytest.fixture(scope="module", params=["lite", "full"])
-def parts(request, tmp_path_factory) -> list[Path]:
+def two_releases(request, tmp_path_factory) -> list[Path]:
     """Return two releases on overlapping layouts with distinct tasks."""
     folder = tmp_path_factory.mktemp(request.param)
     random_release(folder / "a", request.param, ("coord_simple",), teammates=1, streams=2, episodes=5)
@@ -28,13 +28,13 @@ def parts(request, tmp_path_factory) -> list[Path]:
     return [folder / "a", folder / "b"]
 
 
-def test_combined_histories_equal_those_of_the_inputs(parts, tmp_path):
-    arguments = ["combine", *map(str, parts), "--out", str(tmp_path / "out")]
+def test_combined_histories_equal_those_of_the_inputs(two_releases, tmp_path):
+    arguments = ["combine", *map(str, two_releases), "--out", str(tmp_path / "out")]
     run_cli(*arguments)
     report = verify_release(tmp_path / "out", level="deep")
     assert report.ok, report.findings
     combined = load_icrl4aht(tmp_path / "out")
-    before = {(h.entry.task_id, h.entry.env_idx): h for part in parts for h in load_icrl4aht(part)}
+    before = {(h.entry.task_id, h.entry.env_idx): h for root in two_releases for h in load_icrl4aht(root)}
     assert [e.history_id for e in combined.entries] == list(range(8))
     assert {(e.task_id, e.env_idx) for e in combined.entries} == before.keys()
     for history in combined:
@@ -45,15 +45,15 @@ def test_combined_histories_equal_those_of_the_inputs(parts, tmp_path):
     assert "* 8 histories of " in (tmp_path / "out" / "README.md").read_text()
 
 
-def test_combining_a_single_release_keeps_its_bytes(parts, tmp_path):
-    combine_releases(tmp_path / "out", parts[:1])
-    for shard in (parts[0] / "data").rglob("*.h5"):
-        assert (tmp_path / "out" / shard.relative_to(parts[0])).read_bytes() == shard.read_bytes()
+def test_combining_a_single_release_keeps_its_bytes(two_releases, tmp_path):
+    combine_releases(tmp_path / "out", two_releases[:1])
+    for shard in (two_releases[0] / "data").rglob("*.h5"):
+        assert (tmp_path / "out" / shard.relative_to(two_releases[0])).read_bytes() == shard.read_bytes()
 
 
-def test_combining_a_selection_excludes_all_other_histories(parts, tmp_path):
-    chosen = load_icrl4aht(parts[1], layout="demo_wide")[1:]
-    combined = load_icrl4aht(combine_releases(tmp_path / "out", [chosen, parts[0]]))
+def test_combining_a_selection_excludes_all_other_histories(two_releases, tmp_path):
+    chosen = load_icrl4aht(two_releases[1], layout="demo_wide")[1:]
+    combined = load_icrl4aht(combine_releases(tmp_path / "out", [chosen, two_releases[0]]))
     assert combined.counts("layout") == {"demo_wide": 2, "coord_simple": 2}
     assert verify_release(tmp_path / "out").ok
     by_stream = {history.entry.env_idx: history for history in combined.filter(layout="demo_wide")}
@@ -61,9 +61,9 @@ def test_combining_a_selection_excludes_all_other_histories(parts, tmp_path):
         assert np.array_equal(by_stream[history.entry.env_idx].read("actions"), history.read("actions"))
 
 
-def test_combine_refuses_a_task_that_two_releases_contain(parts, tmp_path):
+def test_combine_refuses_a_task_that_two_releases_contain(two_releases, tmp_path):
     with pytest.raises(OptionError, match=r"b: task teammate_train_demo_cook_wide_.* is also in .*b"):
-        combine_releases(tmp_path / "out", [parts[1], parts[0], parts[1]])
+        combine_releases(tmp_path / "out", [two_releases[1], two_releases[0], two_releases[1]])
     assert not (tmp_path / "out").exists()
 
 

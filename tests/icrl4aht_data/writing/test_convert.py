@@ -86,26 +86,26 @@ def test_a_release_is_not_written_over_its_source(lite, write):
             write(dataset, target, overwrite=True)
 
 
-def untyped(value: Any) -> Any:
+def as_any(value: Any) -> Any:
     return value
 
 
 @pytest.mark.parametrize(
     "call",
     [
-        lambda ds: to_release(ds, untyped(3), "lite"),
-        lambda ds: to_release(ds, "out", untyped("heavy")),
-        lambda ds: to_published(ds, untyped(None)),
-        lambda ds: to_minari(ds, untyped(b"out-v0")),
-        lambda ds: to_parquet(ds, untyped(3.5)),
-        lambda ds: from_published(untyped(None), "out"),
-        lambda ds: from_published("files", "out", kept_steps=untyped("many")),
+        lambda ds: to_release(ds, as_any(3), "lite"),
+        lambda ds: to_release(ds, "out", as_any("heavy")),
+        lambda ds: to_published(ds, as_any(None)),
+        lambda ds: to_minari(ds, as_any(b"out-v0")),
+        lambda ds: to_parquet(ds, as_any(3.5)),
+        lambda ds: from_published(as_any(None), "out"),
+        lambda ds: from_published("files", "out", kept_steps=as_any("many")),
         lambda ds: combine_releases("out", str(ds.root)),
-        lambda ds: combine_releases("out", [ds.root], untyped(5)),
-        lambda ds: combine_releases(untyped(["out"]), [ds.root]),
-        lambda ds: build_release(ds.root, untyped(5)),
-        lambda ds: upload_release(ds.root, untyped(None)),
-        lambda ds: verify_release(ds.root, level=untyped(3)),
+        lambda ds: combine_releases("out", [ds.root], as_any(5)),
+        lambda ds: combine_releases(as_any(["out"]), [ds.root]),
+        lambda ds: build_release(ds.root, as_any(5)),
+        lambda ds: upload_release(ds.root, as_any(None)),
+        lambda ds: verify_release(ds.root, level=as_any(3)),
     ],
 )
 def test_wrong_arguments_raise_package_errors(lite, tmp_path, monkeypatch, call):

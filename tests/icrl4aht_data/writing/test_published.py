@@ -1,4 +1,4 @@
-"""Test files of the published code: family names, 4 x 5 views, duplicates and interrupted conversions."""
+"""Test files of the published code: family names, views of 4 x 5 cells, duplicates and interrupted conversions."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_short_views_are_padded_to_5_by_5(short_views, tmp_path):
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
 def test_short_views_are_completed_from_states(short_views, tmp_path, kind):
-    """Missing rows are rendered from states, and changes of recorded rows are found."""
+    """Missing rows of cells are rendered from states, and changed rows are found."""
     files, _, complete = short_views
     shutil.copytree(files, tmp_path / "files")
     dataset = load_icrl4aht(files.parent / "release")

@@ -77,7 +77,7 @@ def test_writing_a_release_twice_gives_equal_bytes(tmp_path):
     assert len(contents(tmp_path / "a")) >= 9
 
 
-def names_in(folder):
+def sorted_names(folder):
     """Return the sorted names of the entries of a folder."""
     return sorted(path.name for path in folder.iterdir())
 
@@ -103,7 +103,7 @@ def raise_error() -> list[NewHistory]:
     [
         (lambda a: a | {"rewards": a["rewards"] + 0.5}, 2, "values that int8 cannot represent"),
         (lambda a: a | {"actions": a["actions"][:-1], "state": a["state"][:-1]}, 2, "rows, found"),
-        (lambda a: {name: a[name] for name in a if name != "episode_end_state"}, 2, "a history lacks the arrays"),
+        (lambda a: {name: a[name] for name in a if name != "episode_end_state"}, 2, "a history does not have arrays"),
         (lambda a: a | {"dones": np.roll(a["dones"], 1)}, 2, "10 steps"),
         (lambda a: a, 1, "expected 1 histories, found 2"),
         (lambda a: a, 3, "expected 3 histories, found 2"),
@@ -118,14 +118,14 @@ def test_invalid_histories_are_refused_without_leftovers(tmp_path, spoil, stream
             streams,
             shard_histories=1,
         )
-    assert names_in(tmp_path) == []
+    assert sorted_names(tmp_path) == []
 
 
 def test_failed_overwrite_keeps_the_old_release(tmp_path):
     root = tmp_path / "release"
     random_release(root, seed=1)
     before = (root / "MANIFEST.sha256").read_bytes()
-    with pytest.raises(OptionError, match="release: exists; give another folder, or replace it by --overwrite"):
+    with pytest.raises(OptionError, match="release: exists; give another folder, or use --overwrite to replace it"):
         write_cramped_up(root, raise_error)
     with pytest.raises(RuntimeError, match="no data"):
         write_cramped_up(root, raise_error, overwrite=True)
@@ -133,14 +133,14 @@ def test_failed_overwrite_keeps_the_old_release(tmp_path):
     assert verify_release(root).ok
     random_release(root, seed=2, overwrite=True)
     assert (root / "MANIFEST.sha256").read_bytes() != before
-    assert names_in(tmp_path) == ["release"], "no lock is left"
+    assert sorted_names(tmp_path) == ["release"], "no lock is left"
 
 
-def test_write_release_refuses_no_tasks_and_duplicate_tasks(tmp_path):
+def test_write_release_refuses_missing_and_duplicate_tasks(tmp_path):
     (task,) = make_tasks(["cramped_up"])
     new = NewTask(task, Provenance(), 1, list)
     for tasks in ([], [new, new]):
-        with pytest.raises(OptionError, match="at least one task and no task twice"):
+        with pytest.raises(OptionError, match="at least one task, and each task once"):
             write_release(tmp_path / "out", "lite", tasks, data_version="0.0.1", card="")
 
 
@@ -195,7 +195,7 @@ def test_overwrite_refuses_folders_with_other_files(tmp_path, make, message):
     root = tmp_path / "release"
     make(root)
     before = contents(tmp_path)
-    with pytest.raises(OptionError, match="exists; give another folder, or replace it by --overwrite"):
+    with pytest.raises(OptionError, match="exists; give another folder, or use --overwrite to replace it"):
         write_cramped_up(root, raise_error)
     with pytest.raises(OptionError, match=message):
         write_cramped_up(root, raise_error, overwrite=True)
@@ -220,8 +220,8 @@ def test_folders_created_during_writing_are_not_replaced(tmp_path):
 @pytest.mark.parametrize(
     ("pause", "delay", "streams"),
     [
-        (60, 0.0, 2),  # killed after the first shard
-        pytest.param(0, 0.05, 40, marks=pytest.mark.slow),  # killed at any later point
+        (60, 0.0, 2),  # the writer is killed after the first shard
+        pytest.param(0, 0.05, 40, marks=pytest.mark.slow),  # the writer is killed later
         pytest.param(0, 0.2, 40, marks=pytest.mark.slow),
     ],
 )
@@ -255,4 +255,4 @@ random_release(Path(sys.argv[1]), streams={streams}, episodes=60, length=100)
     assert not verify_release(tmp_path / ".release.partial").ok
     random_release(root, streams=1)  # the next writer removes the leftovers
     assert verify_release(root).ok
-    assert names_in(tmp_path) == ["release"]
+    assert sorted_names(tmp_path) == ["release"]

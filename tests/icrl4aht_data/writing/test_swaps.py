@@ -57,7 +57,7 @@ def test_teammates_that_share_a_history_are_held_out_together(swap_release, lite
 
 @pytest.mark.parametrize("kind", ["lite", "full", "published"])
 def test_conversions_keep_changes_of_teammates(swap_release, tmp_path, kind):
-    """Copy one task of two, so that only the provenance contains the other teammate."""
+    """Copy one of two tasks, so only the provenance contains the teammate of the other task."""
     part, copy = load_icrl4aht(swap_release).select([1]), tmp_path / "copy"
     if kind == "published":
         to_published(part, tmp_path / "published")
@@ -101,7 +101,7 @@ def test_malformed_teammates_in_provenance_are_refused():
         Provenance.from_json({"swaps": {"every": 2, "teammates": [teammate]}})
 
 
-def test_wants_oracle_compares_the_oracle_with_the_final_return():
+def test_is_oracle_useful_compares_the_oracle_with_the_final_return():
     references = ReferenceEgos(stay=0.0, random=0.0, oracle=20.0, episodes=100)
     assert Provenance(references=references).is_oracle_useful(20.0)
     assert not Provenance(references=references).is_oracle_useful(20.5)

@@ -48,17 +48,17 @@ def policy_path(root: Path) -> str:
 def add_line(name: str) -> Spoil:
     """Add a line to the manifest."""
 
-    def spoil(root: Path) -> None:
+    def append_line(root: Path) -> None:
         with (root / MANIFEST).open("a", encoding="utf-8") as stream:
             stream.write(f"{'0' * 64}  {name}\n")
 
-    return spoil
+    return append_line
 
 
 def replaced(name: str | Callable[[Path], str], make: Make) -> Spoil:
     """Replace a file or folder by what `make` creates."""
 
-    def spoil(root: Path) -> None:
+    def replace_path(root: Path) -> None:
         path = root / (name if isinstance(name, str) else name(root))
         if path.is_dir():
             shutil.rmtree(path)
@@ -66,7 +66,7 @@ def replaced(name: str | Callable[[Path], str], make: Make) -> Spoil:
         path.parent.mkdir(parents=True, exist_ok=True)
         make(path, root)
 
-    return spoil
+    return replace_path
 
 
 def secret_link(path: Path, root: Path) -> None:
@@ -82,45 +82,45 @@ def named_pipe(path: Path, root: Path) -> None:
 
 
 def terabyte(path: Path, root: Path) -> None:
-    """Create a file of a terabyte that takes no disk space."""
+    """Create a sparse file of one terabyte, which takes no disk space."""
     with path.open("wb") as stream:
         stream.truncate(TERABYTE)
 
 
 def file_with(text: str | bytes) -> Make:
-    """Create a file with this content."""
+    """Return a function that creates a file with the given content."""
     return lambda path, root: path.write_bytes(text if isinstance(text, bytes) else text.encode())
 
 
-def deep(levels: int) -> Make:
-    """Create a file of nested JSON objects."""
+def deep_json(levels: int) -> Make:
+    """Return a function that creates a file of nested JSON objects."""
     return file_with('{"a":' * levels + "1" + "}" * levels)
 
 
 def change_json(name: str, change: Callable[[Any], Any]) -> Spoil:
     """Change the parsed content of a JSON file in place, or replace it by the result of `change`."""
 
-    def spoil(root: Path) -> None:
+    def rewrite_json(root: Path) -> None:
         value = json.loads((root / name).read_text())
         changed = change(value)
         (root / name).write_text(json.dumps(value if changed is None else changed))
 
-    return spoil
+    return rewrite_json
 
 
 def change_lines(change: Callable[[list[dict[str, Any]]], list | None], name: str = HISTORIES) -> Spoil:
     """Change the parsed lines of a file of JSON lines in place, or replace them by the result of `change`."""
 
-    def spoil(root: Path) -> None:
+    def rewrite_lines(root: Path) -> None:
         values = [json.loads(line) for line in (root / name).read_text().splitlines()]
         changed = change(values)
         text = "".join(json.dumps(value) + "\n" for value in (values if changed is None else changed))
         (root / name).write_text(text)
 
-    return spoil
+    return rewrite_lines
 
 
-def entry(name: str = HISTORIES, /, **changes: Any) -> Spoil:
+def set_entry(name: str = HISTORIES, /, **changes: Any) -> Spoil:
     """Change fields of the first line of the index."""
     return change_lines(lambda values: values[0].update(changes), name)
 
@@ -130,10 +130,10 @@ def change_info(**changes: Any) -> Spoil:
     return change_json(INFO, lambda value: value.update(changes))
 
 
-def theta(**changes: Any) -> Spoil:
+def set_theta(**changes: Any) -> Spoil:
     """Change theta of the learned teammate, and update the id of the teammate's task."""
 
-    def spoil(root: Path) -> None:
+    def rewrite_task(root: Path) -> None:
         tasks = [Task(**json.loads(line)) for line in (root / TASKS).read_text().splitlines()]
         old = next(task for task in tasks if task.teammate["kind"] == "rl")
         mate = old.teammate | {"theta": old.teammate["theta"] | changes}
@@ -144,18 +144,18 @@ def theta(**changes: Any) -> Spoil:
         for name in (HISTORIES, PROVENANCE):
             (root / name).write_text((root / name).read_text().replace(old.task_id, new.task_id))
 
-    return spoil
+    return rewrite_task
 
 
 def table(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
     """Change the chunk table of the shard in place, or replace it by the result of `change`."""
 
-    def spoil(root: Path) -> None:
+    def rewrite_table(root: Path) -> None:
         rows = np.load(root / TABLE)
         changed = change(rows)
         np.save(root / TABLE, rows if changed is None else changed)
 
-    return spoil
+    return rewrite_table
 
 
 def npy_header(header: str, version: bytes = b"\x01\x00", length: int | None = None) -> Make:
@@ -167,11 +167,11 @@ def npy_header(header: str, version: bytes = b"\x01\x00", length: int | None = N
 def hdf5(change: ChangeFile, name: str = SHARD) -> Spoil:
     """Change an HDF5 file, but not its chunk table."""
 
-    def spoil(root: Path) -> None:
+    def rewrite_hdf5(root: Path) -> None:
         with h5py.File(root / name, "r+") as file:
             change(file, outside_folder(root))
 
-    return spoil
+    return rewrite_hdf5
 
 
 def set_actions(make: ChangeFile) -> ChangeFile:
@@ -238,7 +238,7 @@ def add_case(name: str, case: Case) -> None:
     CASES[name] = case
 
 
-# Cases of paths that lead out of the release
+# Cases of paths that point outside the release
 
 _NAMES = {
     "up": "../outside/new",
@@ -248,7 +248,7 @@ _NAMES = {
     "control": "meta/\x1b[2J",
     "long": "x" * 300,
 }
-add("release", "leads out of the release", {f"manifest: {name}": add_line(path) for name, path in _NAMES.items()})
+add("release", "points outside the release", {f"manifest: {name}": add_line(path) for name, path in _NAMES.items()})
 add("release", "are the same file on some", {"manifest: upper case": add_line(SHARD.replace("teammate", "TEAMMATE"))})
 add("release", "not a file that a release may contain", {"manifest: code": add_line("sitecustomize.py")})
 _many = "".join(f"data/d/d/{number}.h5\n{number:064}  " for number in range(50_000)) + "data/d/d/last.h5"
@@ -256,7 +256,7 @@ add("release", "listed in the manifest, but missing", {"manifest: many lines": a
 
 for _file in (INFO, SHARD, policy_path):
     _label = _file if isinstance(_file, str) else "teammate"
-    add("release", "leads out of the release", {f"link out: {_label}": replaced(_file, secret_link)})
+    add("release", "points outside the release", {f"link out: {_label}": replaced(_file, secret_link)})
     add("release", "neither a file nor a folder", {f"pipe: {_label}": replaced(_file, named_pipe)})
     _too_large = r"expected at most|more than|truncated|twice|chunk table"
     add("release", _too_large, {f"a terabyte: {_label}": replaced(_file, terabyte)})
@@ -277,7 +277,7 @@ def deep_folder(root: Path) -> None:
 _folders = ("data", "meta")
 add(
     "release",
-    "leads out of the release",
+    "points outside the release",
     {f"folder linked out: {name}": replaced(name, folder_link) for name in _folders},
 )
 add("release", "extra: not listed", {"unlisted pipe": replaced("extra", named_pipe)})
@@ -290,23 +290,23 @@ def _add_name_with_terminal_codes(root: Path) -> None:
 
 add("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes": _add_name_with_terminal_codes})
 
-add_hashed("matching regex", {"checkpoint's hash": theta(sha256="../../outside")})
+add_hashed("matching regex", {"checkpoint's hash": set_theta(sha256="../../outside")})
 _paths = {"above": "../../outside", "absolute": "/etc", "backslash": "..\\..\\outside", "surrogate": "\ud800"}
 add_hashed(
-    "expected a path within", {f"checkpoint's path: {name}": theta(checkpoint=path) for name, path in _paths.items()}
+    "expected a path within", {f"checkpoint path: {name}": set_theta(checkpoint=path) for name, path in _paths.items()}
 )
 
 # Cases of extreme numbers, sizes and texts
 
 _integers = {"T": 2**62, "seed": 10**4000}
-add_hashed("Expected `int` <=", {f"index: large {name}": entry(**{name: value}) for name, value in _integers.items()})
-add_hashed("the index implies", {"rows: 2**39": entry(T=2**39)})
+add_hashed("Expected `int` <=", {f"large {name}": set_entry(**{name: value}) for name, value in _integers.items()})
+add_hashed("the index implies", {"rows: 2**39": set_entry(T=2**39)})
 add_hashed("histories", {"info: histories 2**62": change_info(histories=2**62)})
 _size = change_json(INFO, lambda value: value["shards"].update({SHARD: 2**61}))
 add_hashed(r"expected 2,305,843,009,213,693,952 bytes, found \d", {"info: shard of 2**61 bytes": _size})
 add_hashed("shards: expected", {"info: no shards": change_info(shards={})})
 _digits = file_with('{"format_version": ' + "9" * 10**6 + "}")
-add_hashed("malformed", {"info: too deep": replaced(INFO, deep(100_000)), "info: many digits": replaced(INFO, _digits)})
+add_hashed("malformed", {"info: deep": replaced(INFO, deep_json(100_000)), "info: digits": replaced(INFO, _digits)})
 add_hashed("SemVer", {"info: version with terminal codes": change_info(data_version="\x1b[2J")})
 
 
@@ -319,14 +319,14 @@ def nested_lists(levels: int) -> list:
 
 
 _deep_theta = change_lines(lambda values: values[0]["teammate"]["theta"].update(x=nested_lists(400)), TASKS)
-_deep_files = {f"deep: {name}": replaced(name, deep(500)) for name in (INFO, PROVENANCE)}
-add_hashed("levels deep", _deep_files | {"tasks: deep theta": _deep_theta})
+_deep_files = {f"deep: {name}": replaced(name, deep_json(500)) for name in (INFO, PROVENANCE)}
+add_hashed("found more levels", _deep_files | {"tasks: deep theta": _deep_theta})
 _endless_line = file_with(b"a" * 2**24)
 for _of, _file in {"index": HISTORIES, "tasks": TASKS}.items():
     add_hashed("expected at most", {f"{_of}: one endless line": replaced(_file, _endless_line)})
-add_hashed("line 1: ", {"index: a surrogate": entry(task_id="\ud800")})
-add_hashed("line 1: JSON is malformed", {"index: not a number": entry(score=float("nan"))})
-add_hashed("Expected `float` <", {"index: infinite": entry(return_end=1e308)})
+add_hashed("line 1: ", {"index: a surrogate": set_entry(task_id="\ud800")})
+add_hashed("line 1: JSON is malformed", {"index: not a number": set_entry(score=float("nan"))})
+add_hashed("Expected `float` <", {"index: infinite": set_entry(return_end=1e308)})
 
 # Cases of damaged chunk tables and chunks
 
@@ -379,7 +379,7 @@ _TABLES = {
     "archive": archived_table,
 }
 add_hashed("chunk table|expected rows of", {f"table: {name}": replaced(TABLE, make) for name, make in _TABLES.items()})
-add_hashed("covers more than", {"table: huge chunks": table(lambda rows: rows["size"].__setitem__(0, 2**32 - 1))})
+add_hashed("found a larger one", {"table: huge chunks": table(lambda rows: rows["size"].__setitem__(0, 2**32 - 1))})
 add_hashed("cover|crc32", {"table: one offset": table(lambda rows: rows["offset"].__setitem__(slice(None), 0))})
 add_hashed("cannot be", {"table: no bytes": table(lambda rows: rows["size"].__setitem__(0, 0))})
 add_hashed("cannot be|twice", {"chunk that inflates to a gigabyte": inflating_chunk})
@@ -387,13 +387,13 @@ add_hashed("cannot be|twice", {"chunk that inflates to a gigabyte": inflating_ch
 # Cases of HDF5 structures that libhdf5 would follow, load or trust
 
 
-def virtual(group: Any, out: Path) -> None:
+def virtual_data(group: Any, out: Path) -> None:
     layout = h5py.VirtualLayout((4, 120), "i1")
     layout[0] = h5py.VirtualSource(str(out / "secret.h5"), "secret", (120,))
     group.create_virtual_dataset("actions", layout)
 
 
-def external(group: Any, out: Path) -> None:
+def external_data(group: Any, out: Path) -> None:
     group.create_dataset("actions", (480,), "i1", external=[(str(out / "secret.txt"), 0, 480)])
 
 
@@ -407,7 +407,7 @@ def filtered_data(group: Any, out: Path) -> None:
     low.h5d.create(group.id, b"actions", low.h5t.NATIVE_INT8, space, properties)
 
 
-def extra_name(file: Any, out: Path) -> None:
+def add_external_link(file: Any, out: Path) -> None:
     file["0"]["more"] = h5py.ExternalLink(str(out / "secret.h5"), "/secret")
 
 
@@ -417,29 +417,27 @@ def link_group_out(file: Any, out: Path) -> None:
 
 
 _SHARED: dict[str, dict[str, ChangeFile]] = {
-    "lead out of the file": {
+    "point outside the file": {
         "soft link": link(lambda out: h5py.SoftLink("/0/state")),
         "link to a file": link(lambda out: h5py.ExternalLink(str(out / "secret.h5"), "/secret")),
         "link to a pipe": link(lambda out: h5py.ExternalLink(str(out / "pipe"), "/secret")),
     },
-    "in other files|local heap": {"external storage": set_actions(external), "virtual": set_actions(virtual)},
+    "in other files|local heap": {"external storage": set_actions(external_data), "virtual": set_actions(virtual_data)},
     r"filters \[32004\]|found \(\[32004\]": {"a plugin's filter": set_actions(filtered_data)},
     "expected numbers": {
         "texts": typed_actions(h5py.string_dtype()),
         "references": typed_actions(h5py.ref_dtype),
         "records": typed_actions([("a", "i4"), ("b", "i4")]),
     },
-    "groups: expected|lead out of the file": {"group linked out": link_group_out},
+    "groups: expected|point outside the file": {"group linked out": link_group_out},
 }
 """Message -> changes of the first group, of shards and of published files."""
 _OF_SHARDS: dict[str, dict[str, ChangeFile]] = {
     "expected": {"endless rows": new_dataset((2**50,), chunks=(120,), compression="gzip")},
     "chunks": {"huge chunks": new_dataset(chunks=(1, 2**30), maxshape=(4, None), compression="gzip")},
     "not a dataset|expected": {"circle of groups": set_actions(lambda group, out: group.__setitem__("actions", group))},
-    r"expected \[.*found \[.*'more'": {"one name more": extra_name},
-    "attribute": {
-        "attribute of texts": lambda file, out: file.attrs.create("layout", ["x"] * 9),
-    },
+    r"expected \[.*found \[.*'more'": {"one name more": add_external_link},
+    "attribute": {"attribute of texts": lambda file, out: file.attrs.create("layout", ["x"] * 9)},
 }
 for _message, _changes in (_SHARED | _OF_SHARDS).items():
     add_hashed(_message, {f"shard: {name}": hdf5(change) for name, change in _changes.items()})
@@ -448,8 +446,8 @@ for _message, _changes in (_SHARED | _OF_SHARDS).items():
 
 
 def endless_history(root: Path) -> None:
-    """Give all datasets of the first published history 2**39 rows, as its index line then states."""
-    entry("histories_index.jsonl", T=2**39)(root)
+    """Give all datasets and the index line of the first published history 2**39 rows."""
+    set_entry("histories_index.jsonl", T=2**39)(root)
     with h5py.File(root / "histories.h5", "r+") as file:
         group: Any = file["0"]
         for name, old in list(group.items()):
@@ -471,7 +469,7 @@ for _message, _changes in _SHARED.items():
     _spoils = {name: hdf5(change, _H5) for name, change in _changes.items()}
     add("published", f"group /0.*({_message})|cannot be read: .*{_message}", _spoils)
 _PUBLISHED = (_H5, _INDEX)
-for _message, _make in {"leads out": secret_link, "neither a file": named_pipe, "at most|HDF5": terabyte}.items():
+for _message, _make in {"points outside": secret_link, "neither a file": named_pipe, "at most|HDF5": terabyte}.items():
     add("published", _message, {f"{_make.__name__}: {name}": replaced(name, _make) for name in _PUBLISHED})
 _endless = hdf5(new_dataset((2**39,), "i4", chunks=(4096,), compression="gzip"), _H5)
 add("published", "expected numbers of shape", {"endless rows": _endless})
@@ -479,17 +477,17 @@ add("published", "cannot contain the declared|memory", {"endless history": endle
 add(
     "published", "contradicts the|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published_chunks, _H5)}
 )
-add("published", "Expected `int` >= 1", {"rows below zero": entry(_INDEX, T=-5)})
-add("published", "missing", {"group above": entry(_INDEX, h5_group="../0")})
+add("published", "Expected `int` >= 1", {"rows below zero": set_entry(_INDEX, T=-5)})
+add("published", "missing", {"group above": set_entry(_INDEX, h5_group="../0")})
 add("published", "lite", {"circle of groups": hdf5(lambda file, out: file["0"].__setitem__("a", file["0"]), _H5)})
-add("published", "printable", {"task id of surrogates": entry(_INDEX, task_id="\ud800")})
+add("published", "printable", {"task id of surrogates": set_entry(_INDEX, task_id="\ud800")})
 add("published", "expected at most", {"one endless line": replaced(_INDEX, _endless_line)})
 
 # Cases of faulty servers
 
 add("served", "expected at most", {f"a terabyte: {name}": replaced(name, terabyte) for name in (MANIFEST, TABLE)})
 add("served", "expected at most|sha256", {"a terabyte: shard": replaced(SHARD, terabyte)})
-add("served", "leads out of the release", {"names above": add_line("../../new")})
+add("served", "points outside the release", {"names above": add_line("../../new")})
 for _name, _message, _rules in (
     ("endless manifest", "MANIFEST", {"*/MANIFEST.sha256": Long(TERABYTE)}),
     ("endless index", "expected at most|more came|says", {f"*/{HISTORIES}": Long(TERABYTE)}),

@@ -83,7 +83,7 @@ def file_states(folder: Path) -> dict[str, tuple]:
 
 
 def run_step(step: Callable[[], Any]) -> dict[str, Any]:
-    """Run a step; return whether the step succeeded or raised a package error, and its text."""
+    """Run a step; return its output or error message, and whether it raised only package errors."""
     try:
         with time_limit(SECONDS):
             ours, text = True, str(step() or "")
@@ -106,7 +106,7 @@ def read_all_fields(root: Path) -> None:
 
 
 def sample_batches(root: Path) -> None:
-    """Sample a batch of each kind from memory and from a stream."""
+    """Sample an AD batch and a DPT batch, with cache `ram` and with cache `stream`."""
     for cache in ("ram", "stream"):
         dataset = load_icrl4aht(root, cache=cache, threads=1)
         dataset.ad(batch_size=4, length=8)[0]
@@ -121,7 +121,7 @@ def verify_findings(root: Path) -> str:
 
 
 def download_release(root: Path, out: Path, case: Case) -> None:
-    """Download from a server with the faults of a case."""
+    """Download a release from a server with the faults of a case."""
     faults = Faults()
     for path, fault in case.rules.items():
         faults.next(fault, times=10**9, path=path, method=None)
@@ -150,7 +150,7 @@ def steps_of(case: Case, root: Path, out: Path) -> Steps:
 
 
 def run_in_folder(folder: Path, base: Path, case: Case) -> dict[str, Any]:
-    """Run all steps of a case; return outcomes, changes of files, leaked secrets and written bytes."""
+    """Run all steps of a case; return their outcomes, whether files changed, leaked secrets and written bytes."""
     folder.mkdir()
     root, out = folder / "root", folder / "out"
     shutil.copytree(base, root)
@@ -174,8 +174,8 @@ def _contains_secret(path: Path) -> bool:
     return path.stat().st_size < LARGE and SECRET.encode() in path.read_bytes()
 
 
-def make_bases(folder: Path) -> None:
-    """Write the valid release and the valid published files that cases damage."""
+def make_valid_inputs(folder: Path) -> None:
+    """Write a valid release and valid published files, copies of which the hostile cases damage."""
     make_release(folder / "release")
     to_published(load_icrl4aht(folder / "release"), folder / "published")
 
@@ -187,6 +187,6 @@ def bound_process() -> None:
 
 
 def run_case(folder: Path, name: str) -> dict[str, Any]:
-    """Run the case of this name in a folder that `make_bases` has filled."""
+    """Run the case of this name in a folder that `make_valid_inputs` has filled."""
     base = folder / ("published" if CASES[name].kind == "published" else "release")
     return run_in_folder(folder / "case", base, CASES[name])

@@ -28,7 +28,7 @@ def pairs_assignment(members: int, environments: int) -> Assignment:
         ValueError: if a confederate has fewer environments for cross-play than there are other best responses.
     """
     if environments // 4 < members - 1:
-        raise ValueError(f"environments = {environments}: {members} members need at least {4 * members - 4}")
+        raise ValueError(f"environments = {environments}: expected at least {4 * members - 4} for {members} members")
     # The assignment is fixed, so every pair has a fixed number of samples, and shapes are static.
     env = np.tile(np.arange(environments), members)
     confederate = np.repeat(np.arange(members), environments)

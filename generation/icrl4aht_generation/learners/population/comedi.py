@@ -46,7 +46,7 @@ class CoMeDi(Algorithm):
             ValueError: if the number of environments is not a multiple of 8.
         """
         if environments % 8:
-            raise ValueError(f"environments = {environments}: CoMeDi needs a multiple of 8")
+            raise ValueError(f"environments = {environments}: expected a multiple of 8 for CoMeDi")
         quarter = environments // 4
         new, frozen = np.zeros(quarter, int), np.ones(quarter, int)
         first_half = np.arange(quarter) < quarter // 2

@@ -78,7 +78,7 @@ class Assignment(NamedTuple):
 
 
 class Algorithm:
-    """Base class of population algorithms; `memory` is a pytree with an algorithm's own state, such as multipliers."""
+    """Base class of population algorithms. An algorithm keeps its state, such as multipliers, in a pytree `memory`."""
 
     def assignment(self, environments: int) -> Assignment:
         """Return the assignment of policies to agents, with a given number of environments for each member."""
@@ -154,7 +154,7 @@ class PopulationState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Trains policies together on one layout; the PPO updates, nearly all of the work, use every device.
+    """Trains policies together on one layout; the PPO updates, which take most of the time, use all devices.
 
     Args:
         env: environment of the layout.
@@ -201,7 +201,7 @@ class Population:
 
     @cached_property
     def groups(self) -> list[PolicyGroup]:
-        """All policies in groups, each of which one vmap can update."""
+        """Groups of all policies; one vmap can update all policies of a group."""
         # Policies of a group must be adjacent, because a group is a slice of the stacked parameters.
         slots = [self.assignment.agent_slots(policy) for policy in range(self.assignment.policies)]
         shapes = [(p < self.assignment.learning, len(own), len(others)) for p, (own, others) in enumerate(slots)]
@@ -298,7 +298,7 @@ class Population:
             played = played._replace(partner=partner, weight=weight[slots][None])
 
             def by_policy(leaf, shape=group.agent_slots.shape, counting=group.counting):
-                """Reshape an array (T, G * M, ...) to (G, T, counting, ...), without slots that do not count."""
+                """Reshape an array (T, G * M, ...) to (G, T, counting, ...), without slots that only play."""
                 return jnp.moveaxis(leaf.reshape(leaf.shape[0], *shape, *leaf.shape[2:]), 1, 0)[:, :, :counting]
 
             # Every policy starts from its old parameters, so the order of the groups does not matter.
@@ -337,7 +337,7 @@ class Population:
         return raw * scale[policy]
 
     def _returns(self, rollout: Rollout) -> tuple[Float[Array, "P P"], Bool[Array, "P P"]]:
-        """Return the mean return of ended episodes by ego and teammate policy, and whether any episode ended."""
+        """Return the mean return of ended episodes for each ego and teammate policy, and whether any episode ended."""
         size = (self.assignment.policies,) * 2
         pairs = tuple(self.assignment.policy)
         # Several environments have the same pair of policies, so `at[].add` sums over these environments.

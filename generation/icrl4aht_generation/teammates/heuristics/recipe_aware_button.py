@@ -62,9 +62,9 @@ def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple
 
 
 def _choose_action(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], u: Float[Array, " 4"]):
-    """Return the action of a step without idling, and three facts that determine the next random key.
+    """Return the action of a step without idling, and three flags that determine the next random key.
 
-    The facts are whether the teammate considered pressing the button, whether it chose to press the button, and whether
+    The flags are whether the teammate considered pressing the button, whether it chose to press the button, and whether
     it tried to fetch a wrong ingredient.
 
     Args:
@@ -206,7 +206,7 @@ def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[
 
 
 def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
-    """Return whether to leave plates, with only one access cell, to a partner who carries no plate or dish."""
+    """Return whether to leave plates that have only one access cell to a partner who carries no plate or dish."""
     first = jnp.argmax(scene.plate_piles)
     single = jnp.any(scene.plate_piles) & (scene.only_access(first) >= 0)
     carries = (scene.partner_hand == PLATE) | is_dish(scene.partner_hand)
@@ -214,7 +214,7 @@ def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
 
 
 def _step_out_of_way(scene: Scene) -> Int[Array, ""]:
-    """Return a step that leaves the shortest paths of the partner, who carries a dish, to the goals."""
+    """Return a step off the shortest paths to the goals, which a partner with a dish needs."""
     exits, walkable = jnp.asarray(scene.tables.goal_access), jnp.asarray(scene.tables.walkable)
     if not len(exits):
         return jnp.int32(STAY)

@@ -68,7 +68,7 @@ def _choose_action(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[I
     values, allowed = _intent_values(scene, params, waits, jnp.any(needed))
     distance = jax.vmap(scene.nearest_distance)(targets)
     feasible = allowed & (distance < UNREACHABLE)
-    bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)  # prevents wavering between two intents
+    bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)  # for the last intent, to prevent wavering
     scores = jnp.where(feasible, values - params["dist_weight"] * distance + bonus, -jnp.inf)
     best = jnp.argmax(scores)
     target = scene.closest(targets[best])
