@@ -34,7 +34,7 @@ constraints: install ## write the versions in .venv into constraints.txt, once t
 demo: install ## load, sample, verify, train, show what a model earns by its memory (at most 7 minutes)
 	$(BIN)/icrl4aht-data demo
 
-generate: install ## rebuild a dataset, or resume a rebuild: PROFILE=smoke|noise|search|bundle|teach|..., OUT=folder, OPTIONS=...
+generate: install ## rebuild a release, or resume a rebuild: PROFILE=smoke|noise|search|bundle|teach|..., OUT=folder, OPTIONS=...
 	$(BIN)/icrl4aht-data generate --profile $(PROFILE) --out $(OUT) $(OPTIONS)
 
 teammates: install ## train the suite of learned teammates: PROFILE=smoke|small|mini|cpu|paper

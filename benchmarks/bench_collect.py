@@ -78,7 +78,7 @@ def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[st
 
 
 def _last_heuristic_work(profile: Profile) -> Work:
-    """Return the collection of the profile's last task with heuristic teammates, as a unit of work."""
+    """Return the work of collecting the profile's last task that has a heuristic teammate."""
     return replace(profile, presets=("default",)).units()[-1]
 
 

@@ -1,4 +1,4 @@
-"""Returns of the reference egos in every test task, and the package's cards that state them."""
+"""Measure the reference egos on every test task, and write the returns into the package's cards."""
 
 from __future__ import annotations
 

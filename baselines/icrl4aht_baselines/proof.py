@@ -208,7 +208,7 @@ def _training_seconds(timing: Path) -> float:
 
 
 def play_sets(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = True) -> dict[str, dict[str, float]]:
-    """Evaluate an agent on each set of tasks of the proof.
+    """Evaluate an agent on each set of validation tasks.
 
     Args:
         agent: agent to evaluate.

@@ -379,7 +379,7 @@ def teammates(
         available = profile.algorithms or dict.fromkeys(profile.layouts, ALGORITHMS)
         wanted = {layout: [name for name in names if name in algorithms] for layout, names in available.items()}
         if not any(wanted.values()):
-            raise OptionError(f"profile {profile.name} has no teammates by {', '.join(algorithms)}: choose a --layout")
+            raise OptionError(f"profile {profile.name} trains no teammates with {', '.join(algorithms)}; give --layout")
     build_suite(profile, suite, wanted, seed, console, options)
 
 

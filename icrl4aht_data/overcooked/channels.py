@@ -57,7 +57,7 @@ def canonical_positions(layout: Layout) -> np.ndarray:
     if missing:
         raise OptionError(
             f"layout {layout.name}: channels {missing} are not among the {len(CANONICAL_CHANNELS)} canonical channels: "
-            f'use channels="own", or give its piles ingredients that the published layouts have'
+            f'use channels="own", or use ingredients that the published layouts have'
         )
     positions = np.array([CANONICAL_CHANNELS.index(name) for name in names])
     positions.flags.writeable = False  # the cached array is shared by all callers

@@ -182,7 +182,7 @@ class _Renderer:
         patches = np.zeros((*record.shape[:2], self._shape[-1] - self._first), self._dtype)
         kinds = (slice(0, 1), layout.counters), (slice(1, 2), layout.buttons), (slice(2, None), layout.pots)
         for rows, cells in kinds:
-            # All cells of one kind have the same patches, seen from any floor cell, so one view is enough.
+            # The patches of a kind of cell are equal wherever it is seen from, so one view is enough.
             views = [(ego, cell) for cell in cells for ego in self._floor if self._in_window[ego, cell] != NOWHERE]
             if views:
                 record[rows, :, 0] = views[0][0]

@@ -250,7 +250,7 @@ class Layout:
 
     @cached_property
     def tables(self) -> Tables:
-        """Lookup tables of this layout, an argument of the rules, the observations and the scripted agents."""
+        """Lookup tables of this layout, an argument of the functions of rules, observations and scripted agents."""
         return make_tables(self)
 
     def __repr__(self) -> str:

@@ -1,8 +1,8 @@
 """The rules: one step of the game as a pure function, for NumPy and JAX arrays, batch axes first.
 
-Order of a step (paper, App. A.1; constants checked against OvercookedV2): 1. Agents turn and move. 2. Collisions and
-3. exchanges of cells are undone. 4. Agent 0 interacts, then agent 1 in the resulting state. 5. Timers count down. 6. A
-correct delivery changes the recipe.
+Order of a step (paper, App. A.1; constants checked against OvercookedV2): 1. Agents turn and move. 2. Moves onto one
+cell are undone. 3. Moves that swap the agents' cells are undone. 4. Agent 0 interacts, then agent 1 in the resulting
+state. 5. Timers count down. 6. A correct delivery changes the recipe.
 """
 
 from __future__ import annotations

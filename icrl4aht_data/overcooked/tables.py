@@ -37,9 +37,9 @@ Array = Any
 SEARCH_ORDER = (RIGHT, DOWN, LEFT, UP)
 """Order in which the published teammates try moves; the order decides between paths of equal length."""
 
-# Every visible cell is packed into two 32-bit words, so that only the last operation has to write C channels. Bits of
-# a cell's word: item 0..7, pot timer 8..12, recipe 13..18, delivery 19, kind 20..25, and ingredient piles 26..28. Bits
-# of the word of the agents on a cell: self 0..12 (position 1 bit, facing 4, hand 8), other agent 13..25.
+# Every visible cell is packed into two 32-bit words, so that only the last operation has to write C channels.
+# Bits of the first word, the cell: item 0..7, pot timer 8..12, recipe 13..18, delivery 19, kind 20..25, piles 26..28.
+# Bits of the second word, the agents: self 0..12 (position 1 bit, facing 4, hand 8), other agent 13..25.
 TIMER_BIT, RECIPE_BIT, DELIVERY_BIT, FIXED_BIT, _PILES = 8, 13, 19, 20, 26
 AGENT_BITS = 13
 _STATIC = (WALL, GOAL, POT, INDICATOR, BUTTON, PLATES)

@@ -99,7 +99,7 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
             raise OptionError(f"{target} is also read; give another folder to write")
         if read.is_relative_to(resolved) or resolved.is_relative_to(read):
             relation = "contains" if read.is_relative_to(resolved) else "is inside"
-            raise OptionError(f"{target} {relation} {source}, which is read; give another folder to write")
+            raise OptionError(f"{target} {relation} the input folder {source}; give another folder to write")
     if not os.path.lexists(target) or (resolved.is_dir() and not any(resolved.iterdir())):
         return False
     if not overwrite:

@@ -51,7 +51,7 @@ Route = Callable[[Request, bytes], Answer]
 
 
 class Server(ThreadingHTTPServer):
-    """A server that answers by a function, logs every request, and makes the requested faults."""
+    """HTTP server that answers with a given function, logs every request, and injects configured faults."""
 
     request_queue_size = 128
 

@@ -115,7 +115,7 @@ def _resample(stratum: Stratum, resamples: int, rng: np.random.Generator) -> Str
 
 
 def _estimate(groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R T"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean ratio of each resample over groups, and the mean's variance by linearisation, both (R,).
+    """Return the ratio of gains to scales, mean over groups, of each resample, and its variance, both (R,).
 
     Args:
         groups: strata with gains (R, T, U) and scales (R, U).

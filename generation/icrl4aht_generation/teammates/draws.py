@@ -229,7 +229,7 @@ def _sampled_entry(family: str, theta_id: int, base_seed: int) -> dict[str, Any]
 
 
 def usable_families(layout: str, base_seed: int = 0) -> list[str]:
-    """Return the families with usable draws for tasks of a training layout, in the order of the paper."""
+    """Return the families that have usable drawn teammates for a training layout, in the paper's order."""
     return [family for family in HEURISTIC_FAMILIES if _usable(get_layout(layout).name, family, base_seed)]
 
 

@@ -61,7 +61,7 @@ def test_bundled_model_reports_its_name_and_training_record(run, models):
     assert agent.details["trained_on"] == {"teammate": read_trained(run).trained_on}
 
 
-def test_model_bundled_as_sampled_samples_actions_by_default(run, tmp_path, monkeypatch):
+def test_model_bundled_with_sampled_actions_draws_actions_by_default(run, tmp_path, monkeypatch):
     bundle_run(run, "ad-drawn", "teammate", tmp_path, sampled=True)
     monkeypatch.setattr(bundled.bundled_models, "__defaults__", (tmp_path,))
     by_default, greedy = find_agent("ad-drawn"), find_agent("ad-drawn", greedy=True)

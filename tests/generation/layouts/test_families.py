@@ -98,7 +98,7 @@ def test_generated_layouts_have_allowed_fixtures_and_recipes(family, samples):
 
 def test_layouts_of_family_rooms_are_small_and_a_third_separates_agents(samples):
     published = published_rooms(False) | published_rooms(True)
-    assert len(published) == 7  # some layouts, such as coord_simple and test_simple, have equal floor
+    assert len(published) == 7  # some layouts, such as coord_simple and test_simple, have the same floor cells
     for layout in samples["rooms"]:
         assert layout.height <= MOST_ROWS and layout.width <= MOST_COLUMNS
     shared = [np.array_equal(*layout.rooms) for layout in samples["rooms"][:300]]

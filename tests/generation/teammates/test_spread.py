@@ -83,7 +83,7 @@ def test_spread_teammates_are_returned_in_order_of_the_list(small_spread):
     assert small_spread.chosen[0].entry["theta"] == {"w_deliver": 3.0}
 
 
-def test_more_spread_teammates_than_listed_raise_error(small_spread):
+def test_request_for_too_many_spread_teammates_raises_error(small_spread):
     numbers = "demo_wide: 2 validation teammates requested .* has 1: 6 of 9 candidates differ .* and 5 of these"
     with pytest.raises(OptionError, match=numbers):
         spread_teammates("demo_wide", "validation", 2)

@@ -490,7 +490,7 @@ add("served", "expected at most|sha256", {"a terabyte: shard": replaced(SHARD, t
 add("served", "points outside the release", {"names above": add_line("../../new")})
 for _name, _message, _rules in (
     ("endless manifest", "MANIFEST", {"*/MANIFEST.sha256": Long(TERABYTE)}),
-    ("endless index", "expected at most|more came|says", {f"*/{HISTORIES}": Long(TERABYTE)}),
+    ("endless index", "expected at most|sent more|says", {f"*/{HISTORIES}": Long(TERABYTE)}),
     ("endless shard", "expected at most", {"*.h5": Long(TERABYTE)}),
     ("to a local file", "info.json", {f"*/{INFO}": Redirect("file:///etc/passwd")}),
     ("to another protocol", "h5", {"*.h5": Redirect("ftp://127.0.0.1/x")}),
