@@ -49,7 +49,7 @@ def test_test_tasks_can_be_chosen_by_track_layout_and_family():
     assert sizes == [120, 40, 20]
     assert {task.layout.name for task in tasks_of("teammate", "demo_cook_wide")} == {"demo_wide"}
     assert [task.teammate_family for task in tasks_of("teammate", family="H1")] == ["H1"] * 30
-    with pytest.raises(EmptySelectionError, match=r"family = H9: no test task of .*; it has .* H1, H2, H3, H4"):
+    with pytest.raises(EmptySelectionError, match=r"family = H9: no test task of .*, which has .* H1, H2, H3, H4"):
         tasks_of("teammate", family="H9")
     with pytest.raises(UnknownNameError, match="unknown layout 'demo_wid'"):
         tasks_of("teammate", "demo_wid")

@@ -56,11 +56,11 @@ convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps is for publ
 release build a b --out c | unexpected extra argument
 generate --out g --address there:1 | --address needs --executor ray
 train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
-train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
+train ad --layout demo_wide --process 1 | expected --coordinator HOST:PORT as well
 train rl2 --layout demo_wide --size tiny | --size: cannot be used with rl2, which learns by playing
 train rl2 --layout demo_wide --next-obs --context 5 | --context, --next-obs: cannot be used with rl2, which learns
 train ad --layout demo_wide --epochs 2 | --epochs: cannot be used with ad, only with rl2, which learns by playing
-research reference --name rl2-reference --no-evaluate --bundle-as rl2-x | its card states its results
+research reference --name rl2-reference --no-evaluate --bundle-as rl2-x | the card states the results
 research reference --name rl2-reference --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters
 results | Missing option '--out'
 submit empty --out r.json --about a | Missing option '--data'
@@ -84,7 +84,7 @@ combine --out out {MINI} --data-version banana | data version 'banana': expected
 research diversity --suite empty | empty: no layout has all its populations finished; train
 train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
 train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
-collect --agent stay --layout coord_simple --source agent --out c | source = agent: none of Dataset(
+collect --agent stay --layout coord_simple --source agent --out c | source = agent: not in Dataset(
 collect --agent stay --out c --manifest {MINI}/meta/info.json | meta/info.json, line 1: not JSON
 results none.json --out r | none.json: No such file or directory; check the path
 submit empty --out r.json --about a --data b --labels c | empty: no results in empty/tasks

@@ -30,7 +30,7 @@ VERBS = (
         "research reference",
         f"{_MODELS}:reference_command",
         _CHECKS,
-        "Make reference models, with everything that they need.",
+        "Make reference models, and the data that they are trained on.",
     ),
     Verb("research proof", f"{_LAB}:proof_command", _CHECKS, "Show what a release teaches."),
     Verb("research headroom", f"{_LAB}:headroom_command", _CHECKS, "Measure the reference egos on every test task."),

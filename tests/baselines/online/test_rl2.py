@@ -365,7 +365,7 @@ class TestPreparing:
                 PlayOptions(rearranged=6),
                 HistoryOptions(("asymm_both_plain",), source=("search",)),
                 None,
-                "asymm_both_plain: has tasks with a fixed dish",
+                "asymm_both_plain has tasks with a fixed dish",
             ),
         ],
     )

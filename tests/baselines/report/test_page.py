@@ -200,7 +200,9 @@ def test_shown_episodes_are_of_tasks_with_headroom(invented_responses, tmp_path,
 
 def test_restoring_an_unknown_or_missing_ego_raises_error(tmp_path):
     source = evaluated_run("AD").sources[0]
-    with pytest.raises(OptionError, match="AD is neither a reference ego, nor a bundled model, nor of a run folder"):
+    with pytest.raises(
+        OptionError, match="AD is neither a reference ego, nor a bundled model, nor a model with a run folder"
+    ):
         restore_ego(source)
     with pytest.raises(OptionError, match=r"its run folder .*/gone is missing"):
         restore_ego(source._replace(trained={"run": str(tmp_path / "gone")}))

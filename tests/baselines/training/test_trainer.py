@@ -145,7 +145,9 @@ class TestStopping:
         assert Checkpoints(tmp_path / CHECKPOINTS).steps == [4, 5]  # without SAVE_MINUTES, only step 3 would be saved
 
     def test_sigterm_saves_checkpoint_and_training_resumes_bit_for_bit(self, full_run, tmp_path):
-        with pytest.raises(TrainingStopped, match=r"stopped by SIGTERM after step 4 of 7.* resumes the run") as stopped:
+        with pytest.raises(
+            TrainingStopped, match=r"stopped by SIGTERM after step 4 of 7.* the same command resumes it"
+        ) as stopped:
             train_tiny(tmp_path, done=terminate_at_4)
         assert stopped.value.code == 143
         assert Checkpoints(tmp_path / CHECKPOINTS).latest == 4

@@ -222,7 +222,7 @@ def test_repository_changed_during_the_upload_gets_no_tag(hub, published_release
         upload_release(published_release, ADDRESS)
     assert not hub.repo(REPO).tags
     hub.faults.clear()
-    with pytest.raises(UploadError, match=r"belong to no release, such as more\.txt"):
+    with pytest.raises(UploadError, match=r"outside any release, such as more\.txt"):
         upload_release(published_release, ADDRESS)
 
 

@@ -32,7 +32,7 @@ def test_check_output_checks_the_named_files_of_a_folder(tmp_path):
     (tmp_path / "report.md").write_text("old")
     check_output(tmp_path, True, ["report.md"])
     (tmp_path / "page.html").mkdir()
-    with pytest.raises(OptionError, match=r"page\.html: a folder or a link"):
+    with pytest.raises(OptionError, match=r"page\.html: expected a file, found a folder or a link"):
         check_output(tmp_path, True, ["report.md", "page.html"])
     with pytest.raises(OptionError, match="expected a folder, found a file"):
         check_output(tmp_path / "notes.md", True, ["report.md"])
