@@ -25,7 +25,7 @@ _MODULES = {"find_agent": "agents.egos", "from_host": "agents.host", "test_tasks
 
 
 class CallablePackage(ModuleType):
-    """Package whose call runs its function of the same name, such as `evaluate.evaluate`."""
+    """Package that can be called like its function of the same name: `evaluate(...)` runs `evaluate.evaluate(...)`."""
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         return getattr(self, self.__name__.rpartition(".")[2])(*args, **options)

@@ -47,7 +47,7 @@ def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., No
 
 
 def find_equal_teammates() -> list[list[str]]:
-    """Return groups of test task ids whose teammates behave the same, without groups of one task."""
+    """Return groups of ids of test tasks in which the teammates behave the same; each group has two ids or more."""
     tasks = [task for track in TRACKS for task in bundled_tasks(track, "test")]
     return [[task.task_id for task in alike] for alike in find_behaviours(tasks) if len(alike) > 1]
 

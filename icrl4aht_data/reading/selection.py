@@ -387,7 +387,7 @@ class Selection:
         if learner is not None:
             learners = found.column("learner")
             known = ", ".join(map(str, np.unique(learners).tolist()))
-            found = found._select_if(np.isin(learners, learner), f"has learner = {learner!r}; its learners: {known}")
+            found = found._select_if(np.isin(learners, learner), f"has learner = {learner!r}, only {known}")
         if min_expert_return is not None:
             least, returns = check_number("min_expert_return", min_expert_return), found.column("expert_return")
             if np.isnan(returns).any():
@@ -396,7 +396,9 @@ class Selection:
                     f"{np.isnan(returns).sum()} of {len(found)} histories; leave these histories out by "
                     f'ds.select(~np.isnan(ds.column("expert_return")))'
                 )
-            found = found._select_if(returns >= least, f"has expert_return >= {least:g}; highest: {returns.max():g}")
+            found = found._select_if(
+                returns >= least, f"has expert_return >= {least:g}, the highest is {returns.max():g}"
+            )
         if predicate is not None:
             if not callable(predicate):
                 raise OptionError(

@@ -53,7 +53,10 @@ def test_recipes_match_the_settings_of_the_bundled_models():
 
 
 def test_reference_command_rejects_unknown_names(tmp_path):
-    with pytest.raises(OptionError, match=r"rl2-reference does not learn from.*ad-reference, dpt-reference, ad-rising"):
+    with pytest.raises(
+        OptionError,
+        match=r"rl2-reference does not learn from a teacher's histories.*ad-reference, dpt-reference, ad-rising",
+    ):
         reference.check_learns_from_teacher("rl2-reference")
     command = ["research", "reference", "--name", "rl2-reference", "--out", str(tmp_path / "out"), "--teacher"]
     assert "unknown agent" in run_cli(*command, "rl2-referenc", code=2) and not (tmp_path / "out").exists()

@@ -243,7 +243,7 @@ def test_validation_teammate_that_also_trains_raises_error(changed, monkeypatch)
     monkeypatch.setattr(profile_module, "spread_teammates", lambda layout, split, count: [entry] * count)
     counts = "per_layout = 0\nvalidation = { coord_simple = 1 }"
     spread_profile(changed, 'presets = ["default"]', counts)
-    with pytest.raises(OptionError, match="1 of the validation tasks have a teammate of a training task, such as"):
+    with pytest.raises(OptionError, match="1 of the validation tasks have a teammate of a training task, such as team"):
         spread_profile(changed, PRESETS, counts)
 
 

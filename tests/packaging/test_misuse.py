@@ -58,7 +58,7 @@ generate --out g --address there:1 | --address needs --executor ray
 train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
 train ad --layout demo_wide --process 1 | expected --coordinator HOST:PORT as well
 train rl2 --layout demo_wide --size tiny | --size: cannot be used with rl2, which learns by playing
-train rl2 --layout demo_wide --next-obs --context 5 | --context, --next-obs: cannot be used with rl2, which learns
+train rl2 --layout all --next-obs --context 5 | --context, --next-obs: cannot be used with rl2, which learns by playing
 train ad --layout demo_wide --epochs 2 | --epochs: cannot be used with ad, only with rl2, which learns by playing
 research reference --name rl2-reference --no-evaluate --bundle-as rl2-x | the card states the results
 research reference --name rl2-reference --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters

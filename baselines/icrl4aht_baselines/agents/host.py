@@ -38,7 +38,7 @@ class EgoInput(NamedTuple):
 
 
 class HostPolicy(Policy):
-    """A policy whose functions take the keys and `EgoInput`s of B tasks, for agents that JAX cannot batch."""
+    """Policy for agents that JAX cannot batch. Its functions take the keys and `EgoInput`s of B tasks at once."""
 
 
 class HostAgent(Protocol):

@@ -277,7 +277,7 @@ def adaptation_headroom_command(
     help="ad, ad-expert or dpt-expert: the method, and expert labels if it learns them; repeat for several.",
     show_default="all three",
 )
-@click.option("--seeds", type=COUNT, default=3, help="Trainings of each model, with different seeds.")
+@click.option("--seeds", type=COUNT, default=3, help="Training runs of each model, with different seeds.")
 @shared.add_options(*_job_options("runs/proof", PROOF_FILE))
 def proof_command(
     root: Any,

@@ -147,7 +147,7 @@ def reference_command(
     Generates a release of noise histories, trains one model for each track, and evaluates it. Histories of a trained
     agent, if a model learns from them, are recorded first. The same command resumes a stopped run. rl2-reference learns
     by playing with training teammates. ad-reference and dpt-reference learn from histories of rl2-reference, labelled
-    with its choices. ad-rising imitates histories of rl2-reference whose actions are random at first.
+    with its choices. ad-rising imitates histories of rl2-reference that begin with random actions.
     """
     from icrl4aht_baselines.agents.bundled import bundle_run, check_bundle_name
     from icrl4aht_baselines.reference import RECIPES, check_learns_from_teacher, make_reference, write_bundled_card

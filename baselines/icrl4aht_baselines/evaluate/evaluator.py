@@ -269,8 +269,8 @@ def prepare_rollout(
     Args:
         make_ego, tasks, protocol, seeds, suite: see `evaluate`.
         programs: compiled programs to reuse; new programs are added.
-        earlier: rollout of the same tasks with other teammates, from whose state the new rollout continues; None for
-            the first episodes.
+        earlier: finished rollout of the same tasks with other teammates. The new rollout continues from its last state.
+            None for the first episodes.
 
     Raises:
         OptionError: if the ego's action is not one integer for each observation.

@@ -130,7 +130,7 @@ def get_protocol(name: str, episodes: int | None = None) -> Protocol:
 
 
 def hidden_recipe_note(tasks: Sequence[Task]) -> str:
-    """Return a sentence that names the layouts whose observations do not show the ordered dish, or an empty string.
+    """Return a sentence that names layouts on which observations do not show the ordered dish, or an empty string.
 
     Layouts with a single recipe are not named, unless their tasks have a fixed dish, which is one of several.
     """

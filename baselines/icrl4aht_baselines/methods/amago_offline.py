@@ -2,7 +2,7 @@
 
 As in AMAGO (Grigsby et al. 2024), actor and critics share the encoder, and there is one policy and one value for each
 of several discount factors; the ego acts by the last one. Returns continue over episodes, so exploration that helps in
-later episodes is rewarded. The actor imitates the actions whose estimated advantage is positive (filtered behaviour
+later episodes is rewarded. The actor imitates the actions with a positive estimated advantage (filtered behaviour
 cloning), and maximises the expected value of its policy (Q term). The critics learn by one-step bootstrapping from a
 slow copy of the parameters. The model does not observe how far the source algorithm's training had progressed.
 
@@ -26,7 +26,7 @@ from icrl4aht_baselines.methods.tokens import batch_steps
 from icrl4aht_data.sampling.ad import ADBatch
 
 CRITICS = 2
-"""Number of critics, of whose estimates the minimum is used (clipped double Q-learning)."""
+"""Number of critics. The lowest of their estimates is used (clipped double Q-learning)."""
 
 REWARD_SCALE = 0.05
 """Factor of the rewards: a delivery earns 20 points, so values count deliveries."""

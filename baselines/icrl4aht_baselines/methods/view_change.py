@@ -108,7 +108,7 @@ def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> Bat
 
     Args:
         layouts: the N layouts.
-        hidden: names of the layouts whose recipe indicators look like counters.
+        hidden: names of the layouts on which recipe indicators are shown as counters.
     """
     compact = CompactView("paper", tuple(layouts), canonical=True)
     hides = jnp.asarray([layout.name in hidden for layout in layouts])
@@ -165,7 +165,7 @@ class NumberedBatches:
 
 
 def number_layouts(sampler: Any, layouts: Sequence[Layout], mirror: bool = False) -> Any:
-    """Return a sampler whose batches number the layouts by their position in `layouts`."""
+    """Return a sampler of batches in which the number of a layout is its position in `layouts`."""
     numbers = np.array([layouts.index(layout) for layout in sampler.layouts], np.int32)
     if mirror:
         return NumberedBatches(sampler, numbers, len(layouts))

@@ -63,7 +63,7 @@ _SEEDS = 100_000
 
 
 class NoisyMemory(NamedTuple):
-    """Memory of an agent whose actions are sometimes replaced by random ones.
+    """Memory of an agent that sometimes acts at random.
 
     Attributes:
         own: memory of the agent without noise.

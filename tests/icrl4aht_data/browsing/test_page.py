@@ -187,7 +187,9 @@ class TestBrowseCommand:
         for _ in range(2):
             assert run_browse(release).startswith("browse.html: 12 of 12 histories")
         (tmp_path / "browse.html").write_text("<!doctype html>\n<html><title>mine</title>")
-        with pytest.raises(OptionError, match=r"browse\.html: exists; give another name, or use --overwrite"):
+        with pytest.raises(
+            OptionError, match=r"browse\.html: exists; give another name, or use --overwrite to replace it"
+        ):
             run_browse(release)
         assert (tmp_path / "browse.html").read_text().endswith("<title>mine</title>")
 

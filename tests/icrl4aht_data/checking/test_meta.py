@@ -39,7 +39,11 @@ def test_verify_accepts_the_undamaged_release(release):
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        (PROVENANCE, lambda c: first_value(c)["teammate"].update(kind="heuristic"), "contains unknown field `kind`"),
+        (
+            PROVENANCE,
+            lambda c: first_value(c)["teammate"].update(kind="heuristic"),
+            "Object contains unknown field `kind`",
+        ),
         (PROVENANCE, lambda c: c.update(more=first_value(c)), "task 'more': has no history"),
         (PROVENANCE, lambda c: c.pop(next(iter(c))), "': missing"),
         (PROVENANCE, lambda c: first_value(c).update(seed=77), "seed: expected the task's"),

@@ -182,7 +182,7 @@ class TestRecipesOfATask:
     @pytest.mark.parametrize(
         ("recipes", "message"),
         [
-            ([], "expected at least one recipe"),
+            ([], "expected at least one recipe, and no recipe twice"),
             ([[0, 0, 1], [0, 1, 0]], "expected at least one recipe, and no recipe twice"),
             ([[0, 0, 9]], r"recipes use ingredients \[9\] that have no pile"),
             ("000", "recipes"),

@@ -133,9 +133,17 @@ def test_published_files_omit_oracle_actions_and_learner_numbers(lite_release, t
             "expected 4, 2 of each of 2 learners, found 2",
         ),
         (PROVENANCE, lambda c: first_value(c)["noise"].update(episodes=6), "noise.episodes: expected the 5 of history"),
-        (PROVENANCE, lambda c: first_value(c)["noise"].update(end=[0.2, 0.1]), "noise.end: expected a range [least"),
+        (
+            PROVENANCE,
+            lambda c: first_value(c)["noise"].update(end=[0.2, 0.1]),
+            "noise.end: expected a range [least, most]",
+        ),
         (PROVENANCE, lambda c: first_value(c)["nearest_test"].update(teammate="\x1b[2J"), "printable characters"),
-        (PROVENANCE, lambda c: first_value(c)["expert"].update(policy_sha256="0" * 64), "the script labels noise"),
+        (
+            PROVENANCE,
+            lambda c: first_value(c)["expert"].update(policy_sha256="0" * 64),
+            "the script labels noise histories",
+        ),
     ],
 )
 def test_verify_finds_false_learners_sources_and_provenance(lite_release, tmp_path, name, change, message):

@@ -98,7 +98,9 @@ def test_upload_of_other_content_for_an_existing_tag_is_refused(hub, published_r
     first = upload_release(published_release, ADDRESS)
     random_release(tmp_path / "source", streams=2, seed=1)
     other = build_release(tmp_path / "source", tmp_path / "other")
-    with pytest.raises(UploadError, match=r"us/histories: tag v0\.0\.1 exists with other content: .*another"):
+    with pytest.raises(
+        UploadError, match=r"us/histories: tag v0\.0\.1 exists with other content: .*another data version"
+    ):
         upload_release(other, ADDRESS)
     assert hub.repo(REPO).tags == {"v0.0.1": first.commit}
 

@@ -108,7 +108,7 @@ def test_min_expert_return_filter_selects_histories(expert_release):
     dataset = load_icrl4aht(expert_release, source="ppo", min_expert_return=9.5)
     assert dataset.ids.tolist() == [0, 1]
     assert load_icrl4aht(expert_release).select([2, 1]).filter(min_expert_return=-1).ids.tolist() == [2, 1]
-    with pytest.raises(EmptySelectionError, match=r"expert_return >= 10; highest: 9\.5"):
+    with pytest.raises(EmptySelectionError, match=r"expert_return >= 10, the highest is 9\.5"):
         load_icrl4aht(expert_release, source="ppo", min_expert_return=10)
     with pytest.raises(NotStoredError, match=r"2 of 8 histories; leave these histories out by ds\.select"):
         load_icrl4aht(expert_release, min_expert_return=0)

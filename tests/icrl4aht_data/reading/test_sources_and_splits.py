@@ -13,9 +13,9 @@ def test_learner_filter_selects_histories(two_sources):
     assert (len(dataset), set(dataset.column("learner"))) == (8, {1})
     assert len(load_icrl4aht(two_sources[0], learner=[0, 1])) == 40
     assert dataset.filter(layout="demo_wide", learner=1).ids.tolist() == dataset.ids[:4].tolist()
-    with pytest.raises(EmptySelectionError, match=r"has learner = 7; its learners: 0, 1: Dataset"):
+    with pytest.raises(EmptySelectionError, match=r"has learner = 7, only 0, 1: Dataset"):
         load_icrl4aht(two_sources[0], learner=7)
-    with pytest.raises(EmptySelectionError, match=r"has learner = 'first'; its learners: 0, 1"):
+    with pytest.raises(EmptySelectionError, match=r"has learner = 'first', only 0, 1"):
         load_icrl4aht(two_sources[0], learner="first")  # type: ignore[arg-type]
 
 

@@ -102,7 +102,7 @@ def raise_error() -> list[NewHistory]:
     ("spoil", "streams", "message"),
     [
         (lambda a: a | {"rewards": a["rewards"] + 0.5}, 2, "values that int8 cannot represent"),
-        (lambda a: a | {"actions": a["actions"][:-1], "state": a["state"][:-1]}, 2, "rows, found"),
+        (lambda a: a | {"actions": a["actions"][:-1], "state": a["state"][:-1]}, 2, "expected 49 rows, found 50"),
         (lambda a: {name: a[name] for name in a if name != "episode_end_state"}, 2, "a history does not have arrays"),
         (lambda a: a | {"dones": np.roll(a["dones"], 1)}, 2, "10 steps"),
         (lambda a: a, 1, "expected 1 histories, found 2"),

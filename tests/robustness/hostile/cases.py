@@ -249,7 +249,7 @@ _NAMES = {
     "long": "x" * 300,
 }
 add("release", "points outside the release", {f"manifest: {name}": add_line(path) for name, path in _NAMES.items()})
-add("release", "are the same file on some", {"manifest: upper case": add_line(SHARD.replace("teammate", "TEAMMATE"))})
+add("release", "are the same file on some systems", {"manifest: case": add_line(SHARD.replace("teammate", "TEAMMATE"))})
 add("release", "not a file that a release may contain", {"manifest: code": add_line("sitecustomize.py")})
 _many = "".join(f"data/d/d/{number}.h5\n{number:064}  " for number in range(50_000)) + "data/d/d/last.h5"
 add("release", "listed in the manifest, but missing", {"manifest: many lines": add_line(_many)})
