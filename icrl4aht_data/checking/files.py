@@ -15,7 +15,7 @@ from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.provenance import ProvenanceByTask
 from icrl4aht_data.format.schema import EXPERTS, INFO, MANIFEST, PROVENANCE, TEAMMATES
-from icrl4aht_data.utils.files import LARGEST, file_hash, files_below, regular_file_size, resolve_inside
+from icrl4aht_data.utils.files import LARGEST, file_hash, files_below, resolve_inside
 
 _HUB_FILES = (".gitattributes", ".cache/huggingface/")
 """Files that the Hugging Face Hub and its client add to a repository."""
@@ -70,9 +70,8 @@ def check_files(
 def _recorded_sizes(root: Path, listed: Mapping[str, str]) -> dict[str, int]:
     """Return the sizes of the shards in meta/info.json, by shard; empty if that file does not match the manifest."""
     try:
-        path = resolve_inside(root, INFO)
-        regular_file_size(path, LARGEST)
-        return read_info(root).shards if file_hash(path) == listed.get(INFO) else {}
+        shards = read_info(root).shards
+        return shards if file_hash(root / INFO) == listed.get(INFO) else {}
     except (Icrl4ahtError, OSError):  # other checks report errors of meta/info.json
         return {}
 

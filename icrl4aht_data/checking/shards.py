@@ -21,11 +21,10 @@ from icrl4aht_data.format.schema import (
     KINDS,
     Entry,
     Field,
-    curve_ends,
+    curve_fields,
     episode_ends,
     episode_returns,
     record_field,
-    stream_score,
 )
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.layouts import Layout
@@ -106,11 +105,7 @@ def _history_faults(history: History, layout: Layout, kept_steps: int, deep: boo
         for fault in faults(layout, history.read(name)):
             possible = False
             yield f"{name} has {fault}"
-    returns = episode_returns(rewards, dones)[None]
-    first, last = curve_ends(returns)
-    derived = {"return_start": first[0], "return_end": last[0], "return_mean": returns.mean()}
-    derived["score"] = stream_score(returns)[0]
-    for name, value in derived.items():
+    for name, value in curve_fields(episode_returns(rewards, dones)).items():
         if not np.isclose(value, getattr(entry, name), rtol=0, atol=1e-9):
             yield f"{name}: the index says {getattr(entry, name)}, the rewards give {value}"
     if deep and not has_states:

@@ -27,8 +27,6 @@ _CONTENTS = "contents.json"  # file with dtype and shape of every array
 _KEY = re.compile(r"[a-z]+-[0-9a-f]{32,64}")  # only folders with such a name are removed to free space
 _ABANDONED = 24 * 3600  # seconds after which the maker of an unfinished set counts as killed
 
-Arrays = dict[str, np.ndarray]
-
 
 def cacheable_bytes() -> int:
     """Return the maximum size in bytes of a new set of arrays; 0 if the cache folder is not writable."""
@@ -43,7 +41,7 @@ def cacheable_bytes() -> int:
         return 0
 
 
-def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
+def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> dict[str, np.ndarray]:
     """Return the cached arrays of a key, memory-mapped and read-only; build missing arrays first.
 
     The least recently used sets are removed if the cache would exceed its limit or fill the disk. Processes that have
@@ -92,7 +90,7 @@ def new_mapped_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.
     return np.lib.format.open_memmap(path, mode="r+")
 
 
-def _open_arrays(folder: Path) -> Arrays | None:
+def _open_arrays(folder: Path) -> dict[str, np.ndarray] | None:
     """Return the arrays of a folder, and mark the folder as used; None if a file is missing, cut off or damaged."""
     arrays = {}
     if not all(path.is_file() for path in (folder / _CONTENTS, *folder.glob("*.npy"))):  # opening a FIFO would hang
@@ -115,7 +113,7 @@ def _describe(array: np.ndarray) -> list:
     return [array.dtype.str, list(array.shape)]
 
 
-def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> Arrays:
+def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> dict[str, np.ndarray]:
     """Build a set of arrays in `scratch`, move the set to `folder` unless another process was faster, and return it."""
     new = scratch / "new"
     new.mkdir()

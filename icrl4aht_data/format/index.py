@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count, islice
 from operator import attrgetter
@@ -40,7 +40,7 @@ from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_l
 from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, HISTORIES, INFO, KINDS, TEXTS, Entry, as_json, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import LARGEST, read_lines, regular_file_size, resolve_inside, wrap_read_errors
+from icrl4aht_data.utils.files import LARGEST, read_lines, regular_file_size, resolve_inside
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.text import counted_histories, listed_names
@@ -110,8 +110,7 @@ def read_columns(path: Path) -> Columns:
     Raises:
         IndexFormatError: if a line is malformed; the message has the file and the line number.
     """
-    with wrap_read_errors(path):
-        regular_file_size(path, LARGEST)
+    regular_file_size(path, LARGEST)
     # The default of these dictionaries gives each new value the next code.
     codes = {name: defaultdict[str, int](count().__next__) for name in _STRINGS}
     parts: dict[str, list[np.ndarray]] = {name: [] for name in (*_NUMBERS, *_STRINGS)}
@@ -185,14 +184,6 @@ ALIASES = {"algorithm": "teammate_kind"}
 
 LAYOUT_FAMILY = "layout_family"
 """Name of the filter by layout family: "published", or a family of layouts that the release stores."""
-
-_KNOWN_VALUES: dict[str, Callable[[], Sequence[str]]] = {
-    "split": lambda: SPLITS,
-    "track": lambda: ALL_TRACKS,
-    "teammate_family": all_families,
-    "source": lambda: SOURCES,
-    "label_view": lambda: LABEL_VIEWS,
-}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -280,8 +271,8 @@ class Index:
             return get_layout(str(value)).name
         if value in (own := [one for one in self.values(name) if one]):
             return value  # saves time, since `all_families` searches the installed packages
-        known = (*_KNOWN_VALUES.get(name, tuple)(), *own)
-        check_choice(given, value, known)
+        known = {"split": SPLITS, "track": ALL_TRACKS, "source": SOURCES, "label_view": LABEL_VIEWS}.get(name, ())
+        check_choice(given, value, (*known, *(all_families() if name == "teammate_family" else ()), *own))
         return value
 
 

@@ -122,7 +122,8 @@ def write_layouts_file(path: Path, layouts: Iterable[Layout]) -> None:
     own = [layout for layout in dict.fromkeys(layouts) if layout.name not in LAYOUTS]
     for layout in own:
         check_solvable(layout)
-    if lines := list(map(_line, own)):
+    if own:
+        lines = (LayoutLine(one.name, one.rows, one.recipes, one.indicates_delivery, *_origin(one.name)) for one in own)
         path.write_bytes(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
 
 
@@ -130,10 +131,6 @@ def layout_title(name: str) -> str:
     """Return the name of a layout for tables and figures: for a generated layout, the name of the layout's family."""
     generated = _GENERATED(name)
     return name if generated is None else generated[1]
-
-
-def _line(layout: Layout) -> LayoutLine:
-    return LayoutLine(layout.name, layout.rows, layout.recipes, layout.indicates_delivery, *_origin(layout.name))
 
 
 def _origin(name: str) -> tuple[str, int | None, int | None]:

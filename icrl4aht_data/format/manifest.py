@@ -59,11 +59,6 @@ content of a downloaded file such as .git/config, sitecustomize.py or x.pth."""
 _SOURCE_CARD = "meta/source_card.md"  # written only by earlier versions of this package
 
 
-def is_known_file(name: str) -> bool:
-    """Return whether a release may contain a file with the given path; False for the path of the manifest."""
-    return _KNOWN.fullmatch(name) is not None
-
-
 @lru_cache(maxsize=16)
 def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
     """Parse a manifest, and return the SHA-256 of each file by path in the release; results are cached.
@@ -91,7 +86,7 @@ def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
             raise UnsafePathError(
                 f"{path}, line {number}: {name!r} points outside the release: do not use it, and warn the publisher"
             )
-        if not is_known_file(name):
+        if not _KNOWN.fullmatch(name):
             raise UnsafePathError(
                 f"{path}, line {number}: {name[:200]!r} is not a file that a release may contain: do not use it, and "
                 f"warn the publisher; if a later version of this package wrote the release, update the package"
@@ -165,7 +160,7 @@ def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
     """
     known = known or {}
     names = sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
-    foreign = [name for name in names if name != MANIFEST and not is_known_file(name)]
+    foreign = [name for name in names if name != MANIFEST and not _KNOWN.fullmatch(name)]
     if foreign:
         raise UnsafePathError(f"{root}: {foreign[0]!r} is not a file that a release may contain; remove it")
     lines = [f"{known.get(name) or file_hash(root / name)}  {name}\n" for name in names if name != MANIFEST]

@@ -313,14 +313,25 @@ def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     With fewer than 10 episodes, which does not occur in the paper, w is half of N, but at least 1.
 
     Args:
-        returns: (B, N), returns of the episodes in order.
+        returns: (B, N) or (N,), returns of the episodes in order.
 
     Returns:
-        The mean return at the start and the mean return at the end, float64 (B,) each.
+        The mean return at the start and the mean return at the end, float64 (B,) or () each.
     """
     episodes = returns.shape[-1]
     window = max(1, min(max(5, episodes // 10), episodes // 2))
     return returns[..., :window].mean(axis=-1), returns[..., -window:].mean(axis=-1)
+
+
+def curve_fields(returns: np.ndarray) -> dict[str, float]:
+    """Return the fields of an index line that summarize a learning curve: `return_start`, `return_end`, .., `score`.
+
+    Args:
+        returns: (N,), returns of the history's episodes in order.
+    """
+    start, end = curve_ends(returns)
+    fields = {"return_start": start, "return_end": end, "return_mean": returns.mean(), "score": stream_score(returns)}
+    return {name: float(value) for name, value in fields.items()}
 
 
 def are_labels_weak(expert_return: Any, return_end: Any) -> Any:
@@ -339,6 +350,6 @@ def are_labels_weak(expert_return: Any, return_end: Any) -> Any:
 
 
 def stream_score(returns: np.ndarray) -> np.ndarray:
-    """Return the score end + (end - start) of each learning curve (B, N), float64 (B,) (paper, App. F.1)."""
+    """Return the score end + (end - start) of learning curves (B, N) or (N,), float64 (B,) or () (paper, App. F.1)."""
     start, end = curve_ends(returns)
     return end + (end - start)

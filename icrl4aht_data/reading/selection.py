@@ -298,11 +298,10 @@ class Selection:
     @cached_property
     def layout_numbers(self) -> np.ndarray:
         """Index of each history's layout in `layouts`, int32 (H,)."""
-        names = self.index.values("layout")
+        numbers = {layout.name: number for number, layout in enumerate(self.layouts)}
         # A table from the release's codes to the selection's numbers takes one lookup per history, and no comparison.
-        number = np.zeros(len(names), np.int32)
-        number[[names.index(layout.name) for layout in self.layouts]] = np.arange(len(self.layouts))
-        return number[self.column_codes("layout")]
+        table = np.array([numbers.get(name, 0) for name in self.index.values("layout")], np.int32)
+        return table[self.column_codes("layout")]
 
     @cached_property
     def entries(self) -> list[Entry]:

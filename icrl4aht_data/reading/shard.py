@@ -23,13 +23,7 @@ from icrl4aht_data.errors import (
     ShardUnreadableError,
 )
 from icrl4aht_data.fetch import ReleaseLocation
-from icrl4aht_data.format.chunks import (
-    DEFLATE_RATIO,
-    check_chunk,
-    chunk_table_name,
-    decode_chunk,
-    read_table,
-)
+from icrl4aht_data.format.chunks import DEFLATE_RATIO, check_chunk, chunk_table_name, decode_chunk, read_table
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind
@@ -279,9 +273,7 @@ class Shard:
         offset, size = int(self.table["offset"][row]), int(self.table["size"][row])
         if not self.table["rows"][row]:
             return f"bytes {offset}..{offset + size}, between the chunks"
-        (history_id, name), first = max(
-            ((key, first) for key, first in self._first.items() if first <= row), key=lambda item: item[1]
-        )
+        (history_id, name), first = [item for item in self._first.items() if item[1] <= row][-1]
         return f"chunk {row - first} of {name} in history {history_id} (bytes {offset}..{offset + size})"
 
 

@@ -15,7 +15,7 @@ import stat
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO
 
 from filelock import FileLock
 
@@ -240,9 +240,6 @@ def check_folder_content(folder: Path, names: Collection[str], what: str) -> Non
             f"{folder}: has other files ({', '.join(foreign[:3])}), expected {what}, or an empty or new folder; give "
             f"another folder"
         )
-
-
-T = TypeVar("T")
 
 
 @contextmanager

@@ -31,8 +31,6 @@ EXTRAS = {
 }
 """Optional package -> the extra that installs it."""
 
-_DISTRIBUTIONS = {"pil": "pillow"}  # module -> distribution, where their names differ
-
 RESTORE = f"pip install --force-reinstall --no-deps {PACKAGE}, or in a checkout git checkout ."
 """Command that restores missing files of this package."""
 
@@ -76,4 +74,4 @@ def missing_library(module: str) -> str | None:
 def _extra(module: str) -> str:
     """Return the name of the extra that installs a module; an empty string if no extra does."""
     top = module.partition(".")[0].lower()
-    return EXTRAS.get(_DISTRIBUTIONS.get(top, top), "")
+    return EXTRAS.get("pillow" if top == "pil" else top, "")

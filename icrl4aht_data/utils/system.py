@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -88,10 +88,9 @@ def run_in_slices(work: Callable[[int, int], None], n: int, threads: int, least:
     try:
         work(edges[0], edges[1])
     finally:
-        errors = [future.exception() for future in futures]
-    for error in errors:
-        if error is not None:
-            raise error
+        wait(futures)
+    for future in futures:
+        future.result()
 
 
 @cache
@@ -102,8 +101,6 @@ def _get_pool() -> ThreadPoolExecutor:
 if hasattr(os, "register_at_fork"):  # threads do not survive a fork
     os.register_at_fork(after_in_child=_get_pool.cache_clear)
 
-
-_DEFAULT_LIMIT = 100 * 10**9
 
 CACHE_VARIABLE, DATA_VARIABLE = "ICRL4AHT_CACHE_DIR", "ICRL4AHT_DATA_DIR"
 """Environment variables that set the cache folder and the data folder."""
@@ -130,9 +127,7 @@ def cache_limit() -> int:
     Raises:
         OptionError: if $ICRL4AHT_CACHE_BYTES is not a number of bytes.
     """
-    given = os.environ.get("ICRL4AHT_CACHE_BYTES")
-    if not given:
-        return _DEFAULT_LIMIT
+    given = os.environ.get("ICRL4AHT_CACHE_BYTES") or "1e11"
     try:
         limit = int(float(given))
     except (ValueError, OverflowError):

@@ -32,11 +32,10 @@ from icrl4aht_data.format.schema import (
     TASKS,
     Entry,
     Kind,
-    curve_ends,
+    curve_fields,
     episode_ends,
     episode_returns,
     memory_fields,
-    stream_score,
 )
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -244,8 +243,7 @@ class _ShardWriter:
         unfinished = len(dones) % self.kept_steps if self.kind in KINDS else len(dones) < self.kept_steps
         if unfinished or not np.array_equal(dones, episode_ends(len(dones), self.kept_steps)):
             raise OptionError(f"task {task.task_id}: expected histories with episodes of {self.kept_steps} steps")
-        returns = episode_returns(arrays["rewards"], dones)[None]
-        start, end = curve_ends(returns)
+        returns = episode_returns(arrays["rewards"], dones)
         return Entry(
             history_id=-1,
             task_id=task.task_id,
@@ -264,15 +262,12 @@ class _ShardWriter:
             h5_row=None,
             shard="",
             seed=task.seed,
-            episodes=returns.shape[1],
-            score=float(stream_score(returns)[0]),
-            return_start=float(start[0]),
-            return_end=float(end[0]),
-            return_mean=float(returns.mean()),
+            episodes=len(returns),
             source=new.provenance.source or "ppo",
             learner=history.learner,
             has_oracle_actions="oracle_actions" in arrays,
-            **new.provenance.entry_fields(returns.shape[1]),
+            **curve_fields(returns),
+            **new.provenance.entry_fields(len(returns)),
         )
 
     def _with_positions(self, entries: list[Entry], shard: str) -> list[Entry]:
