@@ -130,13 +130,11 @@ def one_history_release(
     kind: Kind = "lite",
     provenance: Provenance | None = None,
     learner: int = 0,
-    copies: int = 1,
 ) -> Path:
     """Write a release of one task on demo_simple with valid hashes, after passing the history's arrays to `change`."""
     (task,) = make_tasks(["demo_simple"])
     arrays = change(random_history(task.layout, 6, 20, np.random.default_rng(5)))
-    histories = [NewHistory(number, arrays, learner) for number in range(copies)]
-    new = NewTask(task, provenance or Provenance(), copies, lambda: histories)
+    new = NewTask(task, provenance or Provenance(), 1, lambda: [NewHistory(0, arrays, learner)])
     return write_release(root, kind, [new], data_version="0.0.1", card="", kept_steps=20)
 
 

@@ -25,6 +25,11 @@ def read_lines(path: Path) -> list[Any]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
+def first_value(content: dict[str, Any]) -> Any:
+    """Return the first value of a dict, such as the provenance of the first task."""
+    return next(iter(content.values()))
+
+
 def change_file(path: Path, change: Change) -> None:
     """Apply a function that changes the content of a JSON or JSONL file in place."""
     is_lines = path.suffix == ".jsonl"

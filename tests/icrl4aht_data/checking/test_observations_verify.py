@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-from pathlib import Path
-from typing import Any
-
 import pytest
 
 from icrl4aht_data import verify_release
@@ -17,22 +13,7 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.commands import run_cli
 from tests.helpers.published_files import KEPT
 from tests.helpers.random_releases import make_tasks
-from tests.helpers.spoiled import problems, spoil
-
-
-@pytest.fixture
-def observations_copy(converted_release, tmp_path) -> Path:
-    """Return a copy of a release of observations that a test may damage."""
-    return shutil.copytree(converted_release, tmp_path / "copy")
-
-
-def write_damaged_history(published_folder, tmp_path: Path, name: str, index: Any, value: Any) -> Path:
-    """Write the first published history, with one value changed, as a release with matching hashes."""
-    arrays = {key: array.copy() for key, array in published_folder[1][0].items()}
-    arrays[name][index] = value
-    (task,) = make_tasks(["demo_wide"])
-    new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)])
-    return write_release(tmp_path / "r", "observations", [new], data_version="0.0.1", card="", kept_steps=KEPT)
+from tests.helpers.spoiled import problems, spoiled
 
 
 class TestVerifyObservations:
@@ -45,16 +26,21 @@ class TestVerifyObservations:
             assert [note[:20] for note in report.notes] == ["nothing was replayed"] * (level == "deep")
 
     def test_deep_verification_finds_an_impossible_observation(self, published_folder, tmp_path):
-        first = 2 * (7 + get_layout("demo_wide").ingredient_types)
-        # the changed observation shows a wall in every cell
-        root = write_damaged_history(published_folder, tmp_path, "obs", (33, slice(None), slice(None), first), 1)
+        arrays = {name: array.copy() for name, array in published_folder[1][0].items()}
+        arrays["obs"][33, :, :, 2 * (7 + get_layout("demo_wide").ingredient_types)] = 1  # a wall in every cell
+        (task,) = make_tasks(["demo_wide"])
+        new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)])
+        root = write_release(tmp_path / "r", "observations", [new], data_version="0.0.1", card="", kept_steps=KEPT)
         assert problems(root) == []
         (found,) = problems(root, level="deep")
         assert found.endswith("obs: 1 steps do not show demo_wide from any cell of the ego's, first step 33")
 
-    def test_verify_finds_wrong_scores_and_episode_counts_in_the_index(self, observations_copy):
-        spoil(observations_copy, HISTORIES, lambda c: (c[0].update(score=c[0]["score"] + 1), c[1].update(episodes=5)))
-        found = problems(observations_copy)
+    def test_verify_finds_wrong_scores_and_episode_counts_in_the_index(self, converted_release, tmp_path):
+        def change(lines: list) -> None:
+            lines[0].update(score=lines[0]["score"] + 1)
+            lines[1].update(episodes=5)
+
+        found = problems(spoiled(converted_release, tmp_path / "r", HISTORIES, change))
         assert any("history 0: score: the index says" in line for line in found), found
         assert any("history 1: dones: expected 5 episodes of 20 steps, found 6" in line for line in found), found
 

@@ -18,13 +18,13 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance
-from icrl4aht_data.format.schema import HISTORIES, INFO
-from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from icrl4aht_data.writing import release
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.shard_writer import metadata_lines
 from tests.helpers.commands import run_cli
+from tests.helpers.damages import flip_bit
 from tests.helpers.random_releases import SHARD, make_tasks, one_history_release, random_history, random_release
 from tests.helpers.spoiled import problems, spoil
 
@@ -35,13 +35,6 @@ def test_deep_verification_accepts_a_valid_release(lite_or_full):
     assert (report.histories, report.transitions) == (12, 1440)
     assert report.files == 9
     assert report.chunks >= 84
-
-
-def flip_random_bit(content: bytes, position: int, rng: np.random.Generator) -> bytes:
-    """Return the content with one random bit flipped in the byte at `position`."""
-    data = bytearray(content)
-    data[position] ^= 1 << rng.integers(8)
-    return bytes(data)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +51,7 @@ def test_verify_finds_every_flipped_bit(converted_release, tmp_path, release, fl
         path = files[number % len(files)]
         content = path.read_bytes()
         position = int(rng.integers(len(content)))
-        path.write_bytes(flip_random_bit(content, position, rng))
+        flip_bit(path, position, int(rng.integers(8)))
         report = verify_release(root)
         assert not report.ok, (path, position)
         if path.name != "MANIFEST.sha256":
@@ -95,10 +88,7 @@ def test_verify_finds_weights_that_do_not_match_their_folder_name(tmp_path):
     assert f"expected {weights.parent.name}, the name of its folder" in found.findings[0].problem
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("expert_return", 0.5), ("expert_return_sampled", None), ("expert_step", 8)]
-)
-def test_verify_finds_expert_returns_that_differ_from_provenance(tmp_path, name, value):
+def test_verify_finds_expert_returns_that_differ_from_provenance(tmp_path):
     labels = ExpertLabels("ab" * 32, "greedy", step=7, return_greedy=0.0, return_sampled=16.9, episodes=200)
     root = one_history_release(tmp_path / "r", provenance=Provenance(source="dqn", expert=labels))
     to_release(load_icrl4aht(root), tmp_path / "converted", "full")
@@ -107,9 +97,10 @@ def test_verify_finds_expert_returns_that_differ_from_provenance(tmp_path, name,
         assert entry.source == "dqn"
         assert (entry.expert_return, entry.expert_return_sampled, entry.expert_step) == (0, 16.9, 7)
         assert not problems(folder)
-    spoil(root, HISTORIES, lambda lines: lines[0].update({name: value}))
-    (problem,) = problems(root)
-    assert f"history 0: {name} {value}, but meta/provenance.json has" in problem
+    wrong = {"expert_return": 0.5, "expert_return_sampled": None, "expert_step": 8}
+    spoil(root, HISTORIES, lambda lines: lines[0].update(wrong))
+    for (name, value), problem in zip(wrong.items(), problems(root), strict=True):
+        assert f"history 0: {name} {value}, but meta/provenance.json has" in problem
 
 
 def change_value(name, index, value):
@@ -176,19 +167,15 @@ def test_deep_verification_finds_observations_that_differ_from_the_state(tmp_pat
 
 
 def test_verify_finds_the_chunk_table_of_another_shard(damaged):
-    other = damaged.with_name("other")
-    random_release(other, streams=2)
-    table = damaged / chunk_table_name(SHARD)
-    shutil.copy(other / chunk_table_name(SHARD), table)
+    random_release(damaged.with_name("other"), streams=2)
+    shutil.copy(damaged.with_name("other") / chunk_table_name(SHARD), damaged / chunk_table_name(SHARD))
     write_manifest(damaged)
-    found = problems(damaged)
-    assert any("the index implies 42 chunks, the chunk table has 28" in line for line in found), found
+    assert any("the index implies 42 chunks, the chunk table has 28" in line for line in problems(damaged))
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda lines: lines.reverse(), "line 1: expected history_id 0, since ids count up from 0, found 11"),
         (lambda lines: lines[1].update(env_idx=lines[0]["env_idx"]), "history 1: stream 0 of its task appears twice"),
         (lambda lines: lines[0].update(layout="test_simple"), "line 1: expected obs_shape"),
         (lambda lines: lines[0].update(score=lines[0]["score"] + 1), "history 0: score: the index says"),
@@ -211,42 +198,35 @@ def test_verify_finds_a_shard_without_index_lines(tmp_path):
     assert any("00001-of-00002.h5: the name of" in problem for problem in found), found
 
 
-def test_verify_finds_equal_histories_of_a_task(tmp_path):
-    root = one_history_release(tmp_path / "r", copies=2)
-    assert problems(root)[0].endswith("history 1: has the content of history 0")
-
-
 def test_verify_finds_episode_lengths_that_differ_from_info(damaged):
     spoil(damaged, INFO, lambda content: content["environment"].update(kept_steps=40))
     assert any("expected 6 episodes of 40 steps, found 6 in 120 steps" in p for p in problems(damaged))
 
 
-@pytest.mark.parametrize(("flips", "texts"), [(1, 1), pytest.param(6, 7, marks=pytest.mark.slow)])
-def test_verify_never_raises_on_damaged_files(damaged, flips, texts):
+def test_verify_never_raises_on_damaged_files(tmp_path):
     """With flipped bits or hostile texts in any file, verify reports problems and never raises."""
-    rng = np.random.default_rng(7)
+    rng, root = np.random.default_rng(7), tmp_path / "release"
+    random_release(root, layouts=("cramped_up",), teammates=1, streams=1, episodes=3)
     hostile = [b'{"format_version": ' + b"9" * 5000 + b"}", b"[" * 5000, b"", b"[]", b"{}", b"null", b"\xff\xfe"]
-    for path in sorted(p for p in damaged.rglob("*") if p.is_file()):
+    for path in sorted(p for p in root.rglob("*") if p.is_file()):
         content = path.read_bytes()
-        spoiled = [flip_random_bit(content, int(rng.integers(len(content))), rng) for _ in range(flips)]
-        for data in [*spoiled, *hostile[:texts], content[: len(content) // 2]]:
-            path.write_bytes(data)
-            assert not verify_release(damaged, level="deep").ok, path
-            if path.name != "MANIFEST.sha256":  # verify again with a manifest that matches the damaged file
-                write_manifest(damaged)
-                verify_release(damaged, level="deep")
-                (damaged / "MANIFEST.sha256").unlink()
-                write_manifest(damaged)
+        for data in [*[None] * 6, *hostile, content[: len(content) // 2]]:
+            path.write_bytes(content if data is None else data)
+            if data is None:
+                flip_bit(path, int(rng.integers(len(content))), int(rng.integers(8)))
+            assert not verify_release(root, level="deep").ok, path
+            if path.name != MANIFEST:  # verify again with a manifest that matches the damaged file
+                write_manifest(root)
+                verify_release(root, level="deep")
         path.write_bytes(content)
-        write_manifest(damaged)
-    assert verify_release(damaged, level="deep").ok
+        write_manifest(root)
+    assert verify_release(root, level="deep").ok
 
 
 def test_verify_finds_chunk_offsets_beyond_the_end_of_the_shard(damaged):
-    path = damaged / chunk_table_name(SHARD)
-    table = np.load(path)
+    table = np.load(damaged / chunk_table_name(SHARD))
     table["offset"][3] = 2**63 + 5
-    np.save(path, table)
+    np.save(damaged / chunk_table_name(SHARD), table)
     write_manifest(damaged)
     assert any("truncated" in problem for problem in problems(damaged))
 
@@ -295,26 +275,18 @@ class TestVerifyCommand:
         assert "valid; checked 9 files, 84 chunks, 12 histories, 1,440 transitions and their physics" in printed
 
     def test_verify_command_names_the_damaged_chunk(self, damaged):
-        path = damaged / SHARD
-        data = bytearray(path.read_bytes())
-        data[int(np.load(damaged / chunk_table_name(SHARD))["offset"][0])] ^= 1
-        path.write_bytes(data)
-        printed = run_cli("verify", damaged, code=1)
-        assert "chunk 0 of state in history 0" in printed
-        printed = run_cli("verify", "--json", damaged, code=1)
-        content = json.loads(printed)
+        flip_bit(damaged / SHARD, int(np.load(damaged / chunk_table_name(SHARD))["offset"][0]))
+        assert "chunk 0 of state in history 0" in run_cli("verify", damaged, code=1)
+        content = json.loads(run_cli("verify", "--json", damaged, code=1))
         assert not content["ok"]
         assert {finding["file"] for finding in content["findings"]} == {SHARD}
 
 
 def test_verify_finds_a_teammate_in_both_training_and_test(tmp_path):
-    rng = np.random.default_rng(0)
-    layout = get_layout("coord_simple")
     (train,) = make_tasks(["coord_simple"])
     tasks = [train, make_task("teammate", "test", "coord_simple", train.teammate, 9)]
-    new = [
-        NewTask(task, Provenance(), 1, lambda: [NewHistory(0, random_history(layout, 6, 20, rng))]) for task in tasks
-    ]
+    arrays = random_history(train.layout, 6, 20, np.random.default_rng(0))
+    new = [NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)]) for task in tasks]
     write_release(tmp_path / "r", "lite", new, data_version="0.0.1", kept_steps=20)
     assert problems(tmp_path / "r") == [
         f"meta/tasks.jsonl: task {tasks[1].task_id!r} (test) has the teammate of {train.task_id!r} (train)"

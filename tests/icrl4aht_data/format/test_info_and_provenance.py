@@ -23,11 +23,6 @@ def test_info_and_provenance_of_the_bundled_release_round_trip(tmp_path):
     assert (tmp_path / "provenance.json").read_bytes() == (MINI / PROVENANCE).read_bytes()
 
 
-def test_provenance_keeps_unknown_fields():
-    note = {"seed": 3, "laboratory": {"city": "elsewhere"}, "other": [1]}
-    assert Provenance.from_json(note).to_json() == note
-
-
 def test_headroom_of_a_learned_teammate_uses_its_self_play_return():
     assert not ReferenceEgos(2.0, 4.75, 6.0, 20).egos_differ
     learned = ReferenceEgos(2.0, 4.75, 6.0, 20, self_play=10.0)
@@ -39,9 +34,10 @@ def test_headroom_of_a_learned_teammate_uses_its_self_play_return():
     assert "self_play" not in made.to_json()["references"]
 
 
-def test_provenance_keeps_expert_fields():
+def test_provenance_keeps_expert_fields_and_unknown_fields():
     labels = {"policy_sha256": "ab" * 32, "action": "greedy", "step": 7, "return_greedy": 0.0, "return_sampled": 16.9}
     note = {"xla_threads": 2, "expert": labels | {"episodes": 200, "last_return_greedy": -1.0}}
+    note |= {"laboratory": {"city": "elsewhere"}, "other": [1]}
     found = Provenance.from_json(note)
     assert found.to_json() == note
     described = {"expert_return": 0.0, "expert_return_sampled": 16.9, "expert_step": 7}
@@ -75,7 +71,6 @@ def test_malformed_provenance_raises_error_that_names_the_fault(tmp_path, note, 
         ({"environment": {"max_steps": 400, "kept_steps": 0}}, "Expected `int` >= 1"),
         ({"environment": {"max_steps": 400, "kept_steps": 100, "speed": 2}}, "unknown field `speed`"),
         ({"data_version": "1.0.0-.."}, r"data version '1\.0\.0-\.\.': expected a SemVer version such as 1.0.0"),
-        ({"data_version": "\x1b[2J"}, r"data version '\\x1b\[2J': expected a SemVer version such as 1.0.0"),
     ],
 )
 def test_malformed_info_raises_error_that_names_the_fault(change, message):

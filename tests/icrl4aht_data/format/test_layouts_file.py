@@ -6,14 +6,13 @@ import dataclasses
 import json
 import pickle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from click import BadParameter
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark.tasks import make_task, parse_task, read_tasks, task_fields, write_tasks
+from icrl4aht_data.benchmark.tasks import parse_task, read_tasks, task_fields, write_tasks
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.options import LAYOUT
 from icrl4aht_data.errors import IndexFormatError, OptionError, TaskFormatError, UnknownNameError
@@ -26,7 +25,7 @@ from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.utils.text import listed_names
 from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import make_tasks, random_release
-from tests.helpers.spoiled import read_lines
+from tests.helpers.spoiled import read_lines, spoil
 
 ROWS = ("WPWWW", "0A A1", "W   W", "WBWXW")
 OTHER = {"family": "other", "seed": None, "number": None}
@@ -61,33 +60,14 @@ def test_reading_tasks_of_a_release_also_reads_its_layouts(root):
         read_tasks_and_layouts(root / TASKS)
 
 
-def write_layout_lines(root: Path, lines: list[Any]) -> Path:
-    (root / LAYOUTS_FILE).write_text("".join(json.dumps(line) + "\n" for line in lines))
-    write_manifest(root)
-    return root
-
-
-def stored_layouts(root: Path) -> list[dict[str, Any]]:
-    return read_lines(root / LAYOUTS_FILE)
-
-
 def test_listed_names_shortens_long_lists():
     assert listed_names([str(i) for i in range(200)]) == "0, 1, 2, 3, 4, 5, 6, 7, 8 and 191 others"
 
 
 class TestReleaseWithLayouts:
     def test_release_stores_and_loads_its_own_layouts(self, root):
-        assert stored_layouts(root) == [
-            {
-                "name": "mine-3-5",
-                "map": list(ROWS),
-                "recipes": [[0, 0, 1], [0, 1, 1]],
-                "indicates_delivery": False,
-                "family": "mine",
-                "seed": 3,
-                "number": 5,
-            }
-        ]
+        line = {"name": "mine-3-5", "map": [*ROWS], "recipes": [[0, 0, 1], [0, 1, 1]], "indicates_delivery": False}
+        assert read_lines(root / LAYOUTS_FILE) == [line | {"family": "mine", "seed": 3, "number": 5}]
         ds = load_icrl4aht(root, obs="uint8", channels="canonical")
         assert ds.info.format_version == FORMAT_VERSION
         assert [layout.name for layout in ds.layouts] == ["coord_simple", "mine-3-5"]
@@ -125,35 +105,34 @@ class TestReleaseWithLayouts:
         assert not (tmp_path / "plain" / LAYOUTS_FILE).exists()
 
     @pytest.mark.parametrize(
-        ("change", "message"),
+        ("fields", "message"),
         [
-            (lambda lines: [], r"unknown layout .*'mine-3-5'"),
-            (lambda lines: lines * 2, "line 2: layout 'mine-3-5' is listed twice"),
-            (
-                lambda lines: [lines[0] | {"name": "coord_simple"} | OTHER],
-                "layout 'coord_simple': differs from the known layout",
-            ),
-            (lambda lines: [lines[0] | {"map": ["WPWWW", *ROWS[1:3], "WBWWW"]}], "no agent can face a goal"),
-            (lambda lines: [lines[0] | {"map": ["WP2W3", *ROWS[1:]]}], "20 cells and piles of 4 ingredient types"),
-            (lambda lines: [lines[0] | {"recipes": [[0, 0, 2]]}], r"recipes use ingredients \[2\]"),
-            (lambda lines: [lines[0] | {"name": "mine\x1b[31m"}], "printable characters, found 'mine"),
-            (
-                lambda lines: [lines[0] | {"map": ["WPWXW", *ROWS[1:3], "WWWBW"], "recipes": [[0, 0, 0]] * 2}],
-                "no recipe twice",
-            ),
-            (
-                lambda lines: [lines[0] | {"map": ["WPWWW", "0A AW", "W   W", "WBWX1"]}],
-                "ingredient 1 cannot reach a pot",
-            ),
-            (lambda lines: [lines[0] | {"family": "rooms"}], r"found \('rooms', 3, 5\)"),
-            (lambda lines: [lines[0] | {"number": 6}], r"expected .* \('mine', 3, 5\)"),
-            (lambda lines: [lines[0] | {"seed": None}], r"found \('mine', None, 5\)"),
-            (lambda lines: [lines[0] | {"name": "mine"}], r"expected .* \('other', None, None\)"),
+            ({"name": "coord_simple"} | OTHER, "layout 'coord_simple': differs from the known layout"),
+            ({"map": ["WPWWW", *ROWS[1:3], "WBWWW"]}, "no agent can face a goal"),
+            ({"map": ["WP2W3", *ROWS[1:]]}, "20 cells and piles of 4 ingredient types"),
+            ({"recipes": [[0, 0, 2]]}, r"recipes use ingredients \[2\]"),
+            ({"name": "mine\x1b[31m"}, "printable characters, found 'mine"),
+            ({"map": ["WPWXW", *ROWS[1:3], "WWWBW"], "recipes": [[0, 0, 0]] * 2}, "no recipe twice"),
+            ({"map": ["WPWWW", "0A AW", "W   W", "WBWX1"]}, "ingredient 1 cannot reach a pot"),
+            ({"family": "rooms"}, r"found \('rooms', 3, 5\)"),
+            ({"number": 6}, r"expected .* \('mine', 3, 5\)"),
+            ({"seed": None}, r"found \('mine', None, 5\)"),
+            ({"name": "mine"}, r"expected .* \('other', None, None\)"),
         ],
     )
-    def test_invalid_stored_layouts_are_refused(self, root, change, message):
+    def test_invalid_stored_layouts_are_refused(self, root, fields, message):
+        spoil(root, LAYOUTS_FILE, lambda lines: lines[0].update(fields))
         with pytest.raises(IndexFormatError, match=message):
-            load_icrl4aht(write_layout_lines(root, change(stored_layouts(root))))
+            load_icrl4aht(root)
+
+    def test_repeated_and_missing_lines_of_layouts_are_refused(self, root):
+        (line,) = read_lines(root / LAYOUTS_FILE)
+        spoil(root, LAYOUTS_FILE, list.clear)
+        with pytest.raises(IndexFormatError, match=r"unknown layout .*'mine-3-5'"):
+            load_icrl4aht(root)
+        spoil(root, LAYOUTS_FILE, lambda lines: lines.extend([line, line]))
+        with pytest.raises(IndexFormatError, match="line 2: layout 'mine-3-5' is listed twice"):
+            load_icrl4aht(root)
 
     def test_missing_layouts_file_is_refused_even_if_the_layout_is_known(self, root):
         load_icrl4aht(root)
@@ -162,11 +141,11 @@ class TestReleaseWithLayouts:
         with pytest.raises(IndexFormatError, match=r"layout 'mine-3-5' is neither published nor in meta/layouts.jsonl"):
             load_icrl4aht(root)
 
-    def test_two_releases_cannot_use_one_name_for_different_maps(self, root, tmp_path):
+    def test_two_releases_cannot_use_one_name_for_different_maps(self, root):
         load_icrl4aht(root)
-        other = [stored_layouts(root)[0] | {"map": ["WWPWW", *ROWS[1:]]}]
+        spoil(root, LAYOUTS_FILE, lambda lines: lines[0].update(map=["WWPWW", *ROWS[1:]]))
         with pytest.raises(IndexFormatError, match="give the new layout another name"):
-            load_icrl4aht(write_layout_lines(root, other))
+            load_icrl4aht(root)
 
 
 class TestRecipesOfATask:
@@ -192,11 +171,6 @@ class TestRecipesOfATask:
         (task,) = make_tasks(["demo_wide"])
         with pytest.raises(TaskFormatError, match=message):
             parse_task(task_fields(task) | {"recipes": recipes})
-
-    def test_make_task_refuses_recipes_of_unavailable_ingredients(self):
-        (task,) = make_tasks(["demo_wide"])
-        with pytest.raises(TaskFormatError, match="no pile"):
-            make_task(task.track, task.split, "demo_wide", task.teammate, 0, [(0, 0, 7)])
 
     def test_histories_and_verification_use_the_recipes_of_the_task(self, tmp_path):
         root = tmp_path / "release"

@@ -51,9 +51,8 @@ def test_an_empty_manifest_is_refused(damaged):
 
 
 def test_meta_file_missing_from_the_manifest_is_refused(damaged):
-    path = damaged / MANIFEST
-    lines = path.read_text().splitlines(keepends=True)
-    path.write_text("".join(line for line in lines if PROVENANCE not in line))
+    lines = (damaged / MANIFEST).read_text().splitlines(keepends=True)
+    (damaged / MANIFEST).write_text("".join(line for line in lines if PROVENANCE not in line))
     with pytest.raises(IndexFormatError, match=rf"{PROVENANCE}: .*{MANIFEST} does not list this file; fetch"):
         load_icrl4aht(damaged)
     (damaged / PROVENANCE).unlink()  # a release may have no provenance.json
@@ -92,9 +91,6 @@ def test_damaged_checkpoints_are_neither_loaded_nor_copied(tmp_path):
 def test_unreadable_file_raises_error_with_its_path(damaged, tmp_path, monkeypatch, name, cache):
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
     (damaged / name).chmod(0)
-    with (
-        enforced_permissions(),
-        pytest.raises(ReleaseError, match=f"{damaged / name}: cannot be read: Permission denied"),
-    ):
+    refused = pytest.raises(ReleaseError, match=f"{damaged / name}: cannot be read: Permission denied")
+    with enforced_permissions(), refused:
         load_icrl4aht(damaged, layout="coord_simple", cache=cache, threads=1).ad(batch_size=2, length=5)[0]
-    shutil.rmtree(tmp_path / "cache", ignore_errors=True)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from icrl4aht_generation.teammates.draws import diverse_tasks, validation_tasks
 from icrl4aht_generation.teammates.instances import published_tasks
 
-from icrl4aht_data.benchmark import tasks
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
 from icrl4aht_data.errors import TaskFormatError
@@ -62,23 +60,17 @@ def test_task_ids_equal_the_160_published_ids():
 
 
 @pytest.mark.parametrize("track", TRACKS)
-def test_bundled_validation_manifests_equal_the_generated_tasks(track):
-    tasks = read_tasks(manifest_path(track, "validation"))
-    assert tasks == validation_tasks(track)
-    assert {task.layout.name for task in tasks} <= {*TRACKS[track]["validation"]}
-
-
-@pytest.mark.parametrize("split", ["train", "validation"])
-@pytest.mark.parametrize("track", TRACKS)
-def test_bundled_diverse_manifests_equal_the_generated_tasks(track, split):
-    tasks = read_tasks(manifest_path(track, split, "diverse"))
-    assert tasks == diverse_tasks(track, split)
-    assert {task.layout.name for task in tasks} == {*TRACKS[track]["train"]}
+def test_bundled_manifests_have_the_layouts_of_their_split(track):
+    found = {task.layout.name for task in read_tasks(manifest_path(track, "validation"))}
+    assert found <= {*TRACKS[track]["validation"]}
+    for split in ("train", "validation"):
+        found = {task.layout.name for task in read_tasks(manifest_path(track, split, "diverse"))}
+        assert found == {*TRACKS[track]["train"]}
 
 
 def test_manifests_check_command_fails_on_a_difference(monkeypatch, tmp_path):
     short = tmp_path / "short.jsonl"
-    tasks.write_tasks(short, published_tasks("layout")[:-1])
+    write_tasks(short, published_tasks("layout")[:-1])
     run_cli("research manifests --check")
     monkeypatch.setattr("icrl4aht_generation.commands.manifest_path", lambda track, split, teammates="": short)
     with pytest.raises(TaskFormatError, match="the file's tasks differ from the tasks of this version"):

@@ -1,4 +1,4 @@
-"""Test columns of the index, data frames, filters by expert return, and warnings about weak labels."""
+"""Test columns of the index, data frames, filters by index fields, counts, and warnings about weak labels."""
 
 from __future__ import annotations
 
@@ -10,21 +10,15 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.errors import (
-    EmptySelectionError,
-    NotStoredError,
-    OptionError,
-    UnknownNameError,
-    WeakLabelsWarning,
-)
+from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, WeakLabelsWarning
 from icrl4aht_data.format.provenance import ExpertLabels, LabelView
 from icrl4aht_data.format.schema import ENTRY_HINTS
 from tests.helpers.random_releases import random_release
 
 
-def expert_labels(greedy: float | None, sampled: float | None = None, view: LabelView | None = "ego") -> ExpertLabels:
-    sha256, returns = "0" * 64, {"return_greedy": greedy, "return_sampled": sampled}
-    return ExpertLabels(sha256, "greedy", step=1000, episodes=200, view=view, **returns)
+def expert_labels(greedy: float, sampled: float, view: LabelView = "ego") -> ExpertLabels:
+    returns = {"return_greedy": greedy, "return_sampled": sampled}
+    return ExpertLabels("0" * 64, "greedy", step=1000, episodes=200, view=view, **returns)
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +112,30 @@ def test_min_expert_return_filter_selects_histories(expert_release):
     for wrong in ("1", True, float("nan")):
         with pytest.raises(OptionError, match="min_expert_return = "):
             load_icrl4aht(expert_release, min_expert_return=wrong)  # type: ignore[arg-type]
+
+
+def test_learner_filter_selects_histories(two_sources):
+    dataset = load_icrl4aht(two_sources[0], source="ppo", learner=1)
+    assert (len(dataset), set(dataset.column("learner"))) == (8, {1})
+    assert len(load_icrl4aht(two_sources[0], learner=[0, 1])) == 40
+    assert dataset.filter(layout="demo_wide", learner=1).ids.tolist() == dataset.ids[:4].tolist()
+    with pytest.raises(EmptySelectionError, match=r"has learner = 7, only 0, 1: Dataset"):
+        load_icrl4aht(two_sources[0], learner=7)
+    with pytest.raises(EmptySelectionError, match=r"has learner = 'first', only 0, 1"):
+        load_icrl4aht(two_sources[0], learner="first")  # type: ignore[arg-type]
+
+
+def test_counts_and_describe_summarize_a_selection(two_sources):
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide")
+    assert dataset.counts("source") == {"ppo": 8, "noise": 12}
+    assert dataset.counts("labels") == {"expert": 20, "oracle": 20}
+    assert dataset.counts("algorithm")["utility_greedy"] > 0
+    assert dataset.filter(source="noise").counts("source") == {"noise": 12}
+    text = dataset.describe()
+    assert text.splitlines()[:3] == [repr(dataset), "split: train (14), validation (6)", "source: ppo (8), noise (12)"]
+    assert "labels: expert (20), oracle (20)" in text
+    with pytest.raises(UnknownNameError, match="unknown field of names 'score'; valid: labels, task_id"):
+        dataset.counts("score")
 
 
 class TestWeakLabels:

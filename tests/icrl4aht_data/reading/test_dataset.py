@@ -17,7 +17,6 @@ from tests.helpers.batches import assert_equal
 @pytest.mark.parametrize(
     ("wanted", "ids"),
     [
-        ({"layout": "demo_wide"}, range(6, 12)),
         ({"layout": "demo_cook_wide"}, range(6, 12)),
         ({"layout": ["demo_wide", "coord_simple"], "split": "train"}, range(12)),
         ({"track": "teammate", "teammate_kind": "utility_greedy"}, range(12)),
@@ -98,7 +97,6 @@ def test_reading_a_range_of_a_field_returns_its_rows(lite, rows):
     "use",
     [
         lambda ds: ds.select([[1], [1, 2]]),
-        lambda ds: ds.select(["a"]),
         lambda ds: ds[True],
         lambda ds: ds["a"],
         lambda ds: ds["a":],
@@ -106,7 +104,6 @@ def test_reading_a_range_of_a_field_returns_its_rows(lite, rows):
         lambda ds: ds[0].episodes[True],
         lambda ds: ds[0].read("actions", "a"),
         lambda ds: ds[0].read("actions", 0, 1.5),
-        lambda ds: ds[0]["nothing"],
     ],
 )
 def test_invalid_positions_raise_package_errors(lite, use):

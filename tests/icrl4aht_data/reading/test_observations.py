@@ -12,7 +12,7 @@ import pytest
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import write_tasks
 from icrl4aht_data.errors import IndexFormatError, LabelsMissingError, NotStoredError, OptionError, PublishedFormatError
-from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS
+from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, TASKS
 from icrl4aht_data.interop import hf_episodes
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing.combine import combine_releases
@@ -35,10 +35,8 @@ class TestConversion:
         for line, arrays in zip(lines, written, strict=True):
             history = by_stream[line["env_idx"]]
             entry = history.entry.to_json()
-            changed = {"history_id", "h5_group", "layout"}
-            assert {k: entry[k] for k in PUBLISHED_FIELDS if k not in changed} == {
-                k: line[k] for k in PUBLISHED_FIELDS if k not in changed
-            }
+            for name in {*PUBLISHED_FIELDS} - {"history_id", "h5_group", "layout"}:
+                assert entry[name] == line[name]
             assert history.entry.layout == get_layout(line["layout"]).name
             assert history.entry.episodes == arrays["dones"].sum() == line["T"] // KEPT
             for name, array in arrays.items():
@@ -53,16 +51,15 @@ class TestConversion:
         to_published(load_icrl4aht(converted_release), tmp_path / "files")
         assert not (tmp_path / "files" / "tasks.jsonl").exists()
         from_published(tmp_path / "files", tmp_path / "back", kept_steps=KEPT)
-        for name in ("meta/histories.jsonl", "meta/tasks.jsonl", "meta/info.json", SHARD):
+        for name in (HISTORIES, TASKS, INFO, SHARD):
             assert (tmp_path / "back" / name).read_bytes() == (converted_release / name).read_bytes(), name
 
     @pytest.mark.parametrize("kind", KINDS)
     def test_states_cannot_be_recovered_from_observations(self, published_folder, converted_release, tmp_path, kind):
         with pytest.raises(OptionError, match=rf"has observations only, but a {kind} release needs state records"):
             to_release(load_icrl4aht(converted_release), tmp_path / "out", kind)
-        with pytest.raises(
-            PublishedFormatError, match=r"group /0: missing state, episode_end_state: .* `--to observations`"
-        ):
+        missing = r"group /0: missing state, episode_end_state: .* `--to observations`"
+        with pytest.raises(PublishedFormatError, match=missing):
             from_published(published_folder[0], tmp_path / "out", kind, kept_steps=KEPT)
 
     def test_releases_with_states_can_be_converted_to_observations(self, lite, reconverted_release, tmp_path):
@@ -73,9 +70,7 @@ class TestConversion:
         for root in (tmp_path / "one", tmp_path / "two"):
             assert (root / SHARD).read_bytes() == (reconverted_release / SHARD).read_bytes()
         assert from_published(tmp_path / "files", tmp_path / "three", kept_steps=KEPT) == "lite"
-
-    def test_files_with_states_in_only_some_groups_are_refused(self, lite, tmp_path):
-        to_published(load_icrl4aht(lite[0]), tmp_path / "files")
+        # files with states in only some groups are refused
         with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
             del file["/4/state"]
         with pytest.raises(PublishedFormatError, match="group /4: missing state"):
@@ -83,12 +78,10 @@ class TestConversion:
 
 
 def assign(name: str, where: Any, value: Any):
-    def assign_value(file: h5py.File, index: list[dict]) -> None:
-        dataset: Any = file[name]
-        array = dataset[()].astype("f4")
+    def assign_value(file: Any, index: list[dict]) -> None:
+        array = file[name][()].astype("f4")
         array[where] = value
-        del file[name]
-        file[name] = array
+        rewrite(name, array)(file, index)
 
     return assign_value
 
@@ -160,9 +153,8 @@ class TestFaultyFiles:
         assert not (tmp_path / "out").exists()
 
     def test_files_with_another_episode_length_are_refused(self, published_folder, tmp_path):
-        with pytest.raises(
-            PublishedFormatError, match=r"group /0: dones: expected an episode end every 100 steps, found 6"
-        ):
+        message = "group /0: dones: expected an episode end every 100 steps, found 6"
+        with pytest.raises(PublishedFormatError, match=message):
             from_published(published_folder[0], tmp_path / "out")
         with pytest.raises(OptionError, match="kept_steps = 0"):
             from_published(published_folder[0], tmp_path / "out", kept_steps=0)
@@ -178,37 +170,32 @@ class TestFaultyFiles:
 class TestTasks:
     def test_teammates_without_tasks_are_known_by_name_only(self, converted_release):
         dataset = load_icrl4aht(converted_release)
-        assert (converted_release / "meta" / "tasks.jsonl").read_text() == ""
+        assert (converted_release / TASKS).read_text() == ""
         assert {entry.seed for entry in dataset.entries} == {-1}
-        with pytest.raises(
-            NotStoredError, match=r"tasks\.jsonl is empty: .* family rl and kind some_variant .* with tasks\.jsonl"
-        ):
+        message = r"tasks\.jsonl is empty: .* family rl and kind some_variant .* with tasks\.jsonl"
+        with pytest.raises(NotStoredError, match=message):
             dataset.recover_teammate(0)
         assert dataset.environment_parameters(0)["layout"] == "demo_wide"
         assert len(load_icrl4aht(converted_release, teammate_family="H2", task_id="task_c")) == 1
 
     def test_tasks_of_published_files_restore_teammates(self, lite, reconverted_release):
         one, two = load_icrl4aht(lite[0]), load_icrl4aht(reconverted_release)
-        assert (reconverted_release / "meta" / "tasks.jsonl").read_text() == (
-            lite[0] / "meta" / "tasks.jsonl"
-        ).read_text()
+        assert (reconverted_release / TASKS).read_text() == (lite[0] / TASKS).read_text()
         assert two.recover_teammate(8) == one.recover_teammate(8)
         assert [entry.seed for entry in two.entries] == [entry.seed for entry in one.entries]
 
     def test_incomplete_task_files_are_refused(self, published_folder, tmp_path):
         source = shutil.copytree(published_folder[0], tmp_path / "source")
         write_tasks(source / "tasks.jsonl", make_tasks(["demo_wide"]))
-        with pytest.raises(
-            PublishedFormatError, match=r"tasks\.jsonl: 3 tasks of the index are missing, such as 'task_a'"
-        ):
+        message = r"tasks\.jsonl: 3 tasks of the index are missing, such as 'task_a'"
+        with pytest.raises(PublishedFormatError, match=message):
             from_published(source, tmp_path / "out", kept_steps=KEPT)
 
 
 class TestMissingStates:
     def test_reading_missing_states_raises_errors(self, converted_release):
-        with pytest.raises(
-            OptionError, match=r'obs = "state": .* has observations only, no state records; use float32'
-        ):
+        message = r'obs = "state": .* has observations only, no state records; use float32'
+        with pytest.raises(OptionError, match=message):
             load_icrl4aht(converted_release, obs="state")
         dataset = load_icrl4aht(converted_release)
         for name in ("state", "episode_end_state"):
@@ -234,9 +221,8 @@ class TestMissingStates:
         has = [number % 3 > 0 for number in range(3000)]
         change = {number: {"has_teammate_actions": value} for number, value in enumerate(has)}
         spoil(tmp_path / "r", HISTORIES, lambda lines: [lines[number].update(change[number]) for number in change])
-        with pytest.raises(
-            IndexFormatError, match=r"histories\.jsonl, line 1: expected has_teammate_actions true in a lite"
-        ):
+        message = r"histories\.jsonl, line 1: expected has_teammate_actions true in a lite"
+        with pytest.raises(IndexFormatError, match=message):
             load_icrl4aht(tmp_path / "r")
         spoil(tmp_path / "r", INFO, lambda info: info.update(kind="observations"))
         assert load_icrl4aht(tmp_path / "r").column("has_teammate_actions").tolist() == has
@@ -262,11 +248,9 @@ class TestBatches:
             assert (np.diff(steps) == np.where((steps[:, :-1] + 2) % KEPT, 1, 2)).all() or order == "random"
             np.testing.assert_array_equal(batch.query_obs, arrays["obs"][query])
             np.testing.assert_array_equal(batch.query_target, arrays["expert_actions"][query])
-            np.testing.assert_array_equal(batch.context_obs, arrays["obs"][steps])
             np.testing.assert_array_equal(batch.context_next_obs, arrays["obs"][steps + 1])
-            np.testing.assert_array_equal(batch.context_actions, arrays["actions"][steps])
-            np.testing.assert_array_equal(batch.context_rewards, arrays["rewards"][steps])
-            np.testing.assert_array_equal(batch.context_teammate_actions, arrays["teammate_actions"][steps])
+            for name in ("obs", "actions", "rewards", "teammate_actions"):
+                np.testing.assert_array_equal(getattr(batch, f"context_{name}"), arrays[name][steps])
         assert met == {t for t in range(low, high) if t % KEPT != KEPT - 1 and t != 129}
 
     def test_queries_are_drawn_from_every_step(self, converted_release):
@@ -288,37 +272,27 @@ class TestBatches:
             load_icrl4aht(converted_release, task_id="task_b").dpt(batch_size=2, context=5)
 
     def test_saved_position_of_other_contexts_is_refused(self, lite, reconverted_release):
-        one, two = (
-            load_icrl4aht(root, layout="demo_wide").dpt(batch_size=2, context=5)
-            for root in (lite[0], reconverted_release)
-        )
+        roots = lite[0], reconverted_release
+        one, two = (load_icrl4aht(root, layout="demo_wide").dpt(batch_size=2, context=5) for root in roots)
         with one.batches() as batches, pytest.raises(OptionError, match="excluded"):
             two.batches().load_state_dict(batches.state_dict())
 
 
-class TestCombine:
-    def test_combine_accepts_releases_of_observations(
-        self, converted_release, published_folder, reconverted_release, lite, tmp_path
-    ):
-        other = shutil.copytree(published_folder[0], tmp_path / "files")
-        index = other / "histories_index.jsonl"
-        index.write_text(index.read_text().replace('": "task_', '": "more_'))
-        from_published(other, tmp_path / "more", kept_steps=KEPT)
-        combine_releases(tmp_path / "out", [converted_release, tmp_path / "more"])
-        assert verify_release(tmp_path / "out", level="deep").ok
-        combined = load_icrl4aht(tmp_path / "out", obs="uint8")
-        assert len(combined) == 8
-        assert not combined.has_tasks
-        before = {
-            (h.entry.task_id, h.entry.env_idx): h
-            for r in (converted_release, tmp_path / "more")
-            for h in load_icrl4aht(r)
-        }
-        for history in combined:
-            old = before[history.entry.task_id, history.entry.env_idx]
-            np.testing.assert_array_equal(history.obs[:], old.obs[:])
-            np.testing.assert_array_equal(history.actions[:], old.actions[:])
-        with pytest.raises(OptionError, match=r"3 of 7 tasks, such as 'task_a', are known by name only: give all"):
-            combine_releases(tmp_path / "mixed", [reconverted_release, converted_release])
-        with pytest.raises(OptionError, match=r"kind 'lite'.*combine only releases of one kind"):
-            combine_releases(tmp_path / "mixed", [converted_release, lite[0]])
+def test_combine_accepts_releases_of_observations(converted_release, published_folder, reconverted_release, tmp_path):
+    other = shutil.copytree(published_folder[0], tmp_path / "files")
+    index = other / HISTORIES_INDEX
+    index.write_text(index.read_text().replace('": "task_', '": "more_'))
+    from_published(other, tmp_path / "more", kept_steps=KEPT)
+    combine_releases(tmp_path / "out", [converted_release, tmp_path / "more"])
+    assert verify_release(tmp_path / "out", level="deep").ok
+    combined = load_icrl4aht(tmp_path / "out", obs="uint8")
+    assert len(combined) == 8
+    assert not combined.has_tasks
+    olds = [history for root in (converted_release, tmp_path / "more") for history in load_icrl4aht(root)]
+    before = {(old.entry.task_id, old.entry.env_idx): old for old in olds}
+    for history in combined:
+        old = before[history.entry.task_id, history.entry.env_idx]
+        np.testing.assert_array_equal(history.obs[:], old.obs[:])
+        np.testing.assert_array_equal(history.actions[:], old.actions[:])
+    with pytest.raises(OptionError, match=r"3 of 7 tasks, such as 'task_a', are known by name only: give all"):
+        combine_releases(tmp_path / "mixed", [reconverted_release, converted_release])

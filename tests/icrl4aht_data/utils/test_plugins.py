@@ -70,10 +70,6 @@ def plugin_folder(tmp_path_factory) -> Path:
     return write_package(tmp_path_factory.mktemp("site"), "rooms", {"maps": MAPS, "methods": METHODS}, POINTS)
 
 
-def write_clashing_package(folder: Path, name: str, layout: str) -> Path:
-    return write_package(folder, name, {}, {"icrl4aht.layouts": {layout: "json:loads"}})
-
-
 def test_registered_layout_can_be_used_by_name(plugin_folder, tmp_path):
     with installed(plugin_folder):
         layout = get_layout("plain_room")
@@ -145,7 +141,7 @@ def test_broken_teammate_and_method_plugins_raise_errors(plugin_folder):
 )
 def test_plugins_with_clashing_or_invalid_names_raise_errors(registered, message, tmp_path):
     for name, layout in registered.items():
-        write_clashing_package(tmp_path, name, layout)
+        write_package(tmp_path, name, {}, {"icrl4aht.layouts": {layout: "json:loads"}})
     with installed(tmp_path):
         with pytest.raises(PluginError, match=message):
             get_layout("elsewhere")
