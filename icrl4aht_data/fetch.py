@@ -336,7 +336,7 @@ def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | 
         if error.missing:
             raise RootNotFoundError(f"{url}: no release at this address, expected {MANIFEST}: {error}") from None
         raise
-    disk.regular_file_size(path, disk.TEXT_BYTES)
+    disk.check_file_size(path, disk.TEXT_BYTES)
     return path, path.read_bytes()
 
 

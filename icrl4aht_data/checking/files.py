@@ -77,11 +77,7 @@ def _recorded_sizes(root: Path, listed: Mapping[str, str]) -> dict[str, int]:
 
 
 def check_references(
-    listed: Mapping[str, str],
-    index: Index,
-    played: Iterable[Task],
-    provenance: ProvenanceByTask | None,
-    report: Report,
+    listed: Mapping[str, str], index: Index, played: Iterable[Task], provenance: ProvenanceByTask | None, report: Report
 ) -> None:
     """Check that each shard, chunk table and checkpoint in the manifest belongs to a history or a task.
 

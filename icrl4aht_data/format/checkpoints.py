@@ -8,7 +8,7 @@ from typing import Any
 
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.schema import EXPERTS, TEAMMATES
-from icrl4aht_data.utils.files import regular_file_size, resolve_inside
+from icrl4aht_data.utils.files import check_file_size, resolve_inside
 
 CHECKPOINT_BYTES = 64 * 2**20
 """Maximum size in bytes of a checkpoint file, sixty times the size of the paper's network."""
@@ -74,5 +74,5 @@ def _policy_files(folder: Path, root: Path | None) -> list[Path]:
     for path in found:
         if root is not None:
             resolve_inside(root, path.relative_to(root).as_posix())
-        regular_file_size(path, CHECKPOINT_BYTES)
+        check_file_size(path, CHECKPOINT_BYTES)
     return found

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count, islice
 from operator import attrgetter
 from pathlib import Path
@@ -40,7 +40,7 @@ from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_l
 from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, HISTORIES, INFO, KINDS, TEXTS, Entry, as_json, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import LARGEST, read_lines, regular_file_size, resolve_inside
+from icrl4aht_data.utils.files import read_lines, resolve_inside
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.text import counted_histories, listed_names
@@ -50,9 +50,9 @@ QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", 
 
 _BLOCK = 2**12  # number of entries in memory at a time
 
-_DERIVED = ("history_id", "obs_shape")  # fields not stored in columns: the row and the layout determine their values
 _DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int64, float | None: np.float64}
-_NUMBERS = {name: _DTYPES[hint] for name, hint in ENTRY_HINTS.items() if hint in _DTYPES and name not in _DERIVED}
+# The fields `history_id` and `obs_shape` have no columns, since the row and the layout determine their values.
+_NUMBERS = {name: _DTYPES[hint] for name, hint in ENTRY_HINTS.items() if hint in _DTYPES and name != "history_id"}
 _ABSENT = {name: -1 for name, hint in ENTRY_HINTS.items() if hint == int | None}  # stands for None in a column
 _ABSENT |= {name: np.nan for name, hint in ENTRY_HINTS.items() if hint == float | None}
 _STRINGS = tuple(name for name, hint in ENTRY_HINTS.items() if hint in TEXTS or name in ENCODED)
@@ -110,7 +110,6 @@ def read_columns(path: Path) -> Columns:
     Raises:
         IndexFormatError: if a line is malformed; the message has the file and the line number.
     """
-    regular_file_size(path, LARGEST)
     # The default of these dictionaries gives each new value the next code.
     codes = {name: defaultdict[str, int](count().__next__) for name in _STRINGS}
     parts: dict[str, list[np.ndarray]] = {name: [] for name in (*_NUMBERS, *_STRINGS)}
@@ -200,7 +199,7 @@ class Index:
     root: Path
     info: ReleaseInfo
     entries: Columns
-    layouts: ReleaseLayouts = field(default_factory=lambda: ReleaseLayouts({}))
+    layouts: ReleaseLayouts
 
     def __repr__(self) -> str:
         return f"Index({counted_histories(len(self.entries))} at {self.root})"

@@ -241,15 +241,14 @@ def read_info(root: Path) -> ReleaseInfo:
     raise FormatTooOldError(f"{found}: fetch a newer version of the release")
 
 
-def check_version(version: str) -> str:
-    """Check that a data version is valid SemVer, and return the version.
+def check_version(version: str) -> None:
+    """Check that a data version is valid SemVer.
 
     Raises:
         OptionError: if the version is not valid, or longer than 100 characters.
     """
     if not isinstance(version, str) or len(version) > _VERSION_LENGTH or not _SEMVER.fullmatch(version):
         raise OptionError(f"data version {version!r:.100}: expected a SemVer version such as 1.0.0 or 1.0.0-rc.1")
-    return version
 
 
 def make_info(

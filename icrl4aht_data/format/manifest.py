@@ -28,10 +28,10 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.utils.files import (
     LARGEST,
     atomic_write,
+    check_file_size,
     file_hash,
     is_safe_path,
     read_text,
-    regular_file_size,
     resolve_inside,
     wrap_read_errors,
 )
@@ -123,7 +123,7 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
         kind = ChunkTableError if name.startswith("meta/chunks/") else IndexFormatError
         try:
             with wrap_read_errors(path):
-                regular_file_size(path, LARGEST)
+                check_file_size(path, LARGEST)
                 found = file_hash(path) if name in listed else None
         except IndexFormatError as error:
             raise kind(str(error)) from error

@@ -37,9 +37,8 @@ READABLE_VERSIONS = (4, FORMAT_VERSION)
 """Format versions that this package reads; other versions raise `FormatTooOldError` or `FormatTooNewError`."""
 
 MANIFEST = "MANIFEST.sha256"
-INFO, HISTORIES, TASKS, PROVENANCE = (
-    f"meta/{name}" for name in ("info.json", "histories.jsonl", "tasks.jsonl", "provenance.json")
-)
+INFO, HISTORIES = "meta/info.json", "meta/histories.jsonl"
+TASKS, PROVENANCE = "meta/tasks.jsonl", "meta/provenance.json"
 
 LAYOUTS_FILE = "meta/layouts.jsonl"
 """Path of the layouts stored in a release, see `layouts_file`; absent if the benchmark has all of its layouts."""

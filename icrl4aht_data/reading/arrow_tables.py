@@ -105,12 +105,11 @@ def episode_table(history: History, schema: pa.Schema) -> pa.Table:
     columns = []
     for field in schema:
         if field.name in ENTRY_HINTS:
-            column = arrow.repeat(arrow.scalar(getattr(entry, field.name), field.type), count)
+            columns.append(arrow.repeat(arrow.scalar(getattr(entry, field.name), field.type), count))
         elif values[field.name] is None:
-            column = arrow.nulls(count, field.type)
+            columns.append(arrow.nulls(count, field.type))
         else:
-            column = _nested_lists(values[field.name], field.type)
-        columns.append(column)
+            columns.append(_nested_lists(values[field.name], field.type))
     return arrow.Table.from_arrays(columns, schema=schema)
 
 

@@ -30,18 +30,13 @@ from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.system import new_array
 
-_CACHE_BYTES = 256 * 2**20
+_CACHE_BYTES = 256 * 2**20  # maximum bytes of the decoded chunks in a cache
 
 
 class ChunkCache:
-    """Thread-safe cache of a release's decoded chunks, of limited size; drops the least recently used chunks.
+    """Thread-safe cache of a release's decoded chunks, of limited size; drops the least recently used chunks."""
 
-    Args:
-        size: limit in bytes; the newest chunk remains in the cache even if it is larger than the limit.
-    """
-
-    def __init__(self, size: int = _CACHE_BYTES) -> None:
-        self._size = size
+    def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
@@ -49,11 +44,8 @@ class ChunkCache:
         self._chunks: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
         self._bytes, self._process, self._lock = 0, os.getpid(), threading.Lock()
 
-    def __getstate__(self) -> int:
-        return self._size  # a pickled cache is empty: the receiving process fills its own
-
-    def __setstate__(self, size: int) -> None:
-        self.__init__(size)
+    def __reduce__(self) -> tuple:
+        return ChunkCache, ()  # a pickled cache is empty: the receiving process fills its own
 
     def get(self, key: tuple[str, int]) -> np.ndarray | None:
         """Return the chunk with the key (shard, row of its chunk table), or None if it is not cached."""
@@ -71,7 +63,7 @@ class ChunkCache:
             if key not in self._chunks:
                 self._chunks[key] = rows
                 self._bytes += rows.nbytes
-            while self._bytes > self._size and len(self._chunks) > 1:
+            while self._bytes > _CACHE_BYTES and len(self._chunks) > 1:
                 self._bytes -= self._chunks.popitem(last=False)[1].nbytes
 
 

@@ -24,14 +24,17 @@ from icrl4aht_data.errors import DiskFullError, IndexFormatError, OptionError, U
 TEXT_BYTES = 64 * 2**20
 """Maximum bytes of a text file: six times our largest text file, the provenance of ten thousand tasks."""
 
+LARGEST = 4 * 2**30
+"""Maximum bytes of a file of a release, except shards."""
+
 LINE_BYTES = 2**20
 """Maximum bytes of a line of a text file."""
 
 _DEPTH = 64  # maximum nesting of JSON, well below the depth of Python's stack
 
 
-def regular_file_size(path: Path, most: int) -> int:
-    """Return the size in bytes of a regular file.
+def check_file_size(path: Path, most: int) -> None:
+    """Check that a file is a regular file of at most `most` bytes.
 
     Raises:
         IndexFormatError: if the file is missing, not a regular file, or larger than `most`.
@@ -42,7 +45,6 @@ def regular_file_size(path: Path, most: int) -> int:
         raise IndexFormatError(f"{path}: not a regular file")
     if status.st_size > most:
         raise IndexFormatError(f"{path}: expected at most {most:,} bytes, found {status.st_size:,}")
-    return status.st_size
 
 
 def read_text(path: Path) -> str:
@@ -51,18 +53,18 @@ def read_text(path: Path) -> str:
     Raises:
         IndexFormatError: if the file is missing, unreadable, too large or not UTF-8.
     """
-    regular_file_size(path, TEXT_BYTES)
+    check_file_size(path, TEXT_BYTES)
     with wrap_read_errors(path):
         return path.read_text(encoding="utf-8")
 
 
 def read_lines(path: Path) -> Iterator[str]:
-    """Yield the lines of a text file of any size, without newlines.
+    """Yield the lines of a text file of at most `LARGEST` bytes, without newlines.
 
     Raises:
-        IndexFormatError: if the file is missing, unreadable or not UTF-8, or a line is too long.
+        IndexFormatError: if the file is missing, unreadable, too large or not UTF-8, or a line is too long.
     """
-    regular_file_size(path, 2**62)
+    check_file_size(path, LARGEST)
     with wrap_read_errors(path), path.open("rb") as stream:
         for number, line in enumerate(iter(lambda: stream.readline(LINE_BYTES), b""), start=1):
             if len(line) == LINE_BYTES:
@@ -257,24 +259,19 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
         filelock.Timeout: if another process holds the lock and `wait` is False.
         OSError: if the lock file cannot be created.
     """
-    lock = FileLock(path, timeout=-1 if wait else 0)
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock.acquire()
-    try:
-        yield
-    finally:
-        with suppress(OSError):  # Windows cannot remove an open file: there, `release` removes the file
-            path.unlink()
-        lock.release()
+    with FileLock(path, timeout=-1 if wait else 0):
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # Windows cannot remove an open file: there, `FileLock` removes the file
+                path.unlink()
 
 
 def lock_path(folder: Path) -> Path:
     """Return the path of a folder's lock file, next to the folder, which can be renamed or removed while locked."""
     return folder.with_name(f".{folder.name}.lock")
 
-
-LARGEST = 4 * 2**30
-"""Maximum bytes of a file of a release, except shards."""
 
 _WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 _RESERVED = re.compile(r'[\\:*?"<>|]')

@@ -15,7 +15,7 @@ from safetensors.numpy import save as to_bytes
 
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.checkpoints import CHECKPOINT_BYTES
-from icrl4aht_data.utils.files import parse_json, read_text, regular_file_size, sync
+from icrl4aht_data.utils.files import check_file_size, parse_json, read_text, sync
 from icrl4aht_data.utils.options import replace_options
 from icrl4aht_generation.learners.config import PPOConfig, Widths
 from icrl4aht_generation.learners.network import ActorCritic
@@ -78,7 +78,7 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
     """
     card = load_card(folder)
     try:
-        regular_file_size(folder / POLICY_WEIGHTS, CHECKPOINT_BYTES)
+        check_file_size(folder / POLICY_WEIGHTS, CHECKPOINT_BYTES)
         network = ActorCritic(replace_options(Widths(), card["widths"]), card["partners"])
         expected = card["shapes"]
         weights = _with_zero_rows(load_file(folder / POLICY_WEIGHTS), expected)
