@@ -88,10 +88,10 @@ def load_icrl4aht(
         min_expert_return: only histories whose expert actions come from a policy that earned at least this much per
             episode, acting greedily with the history's teammate: `entry.expert_return`.
         obs: dtype of observations: "float32", "uint8" (the same integers), or "state" for state records instead of
-            observations; see `history.OBS`.
+            observations; see `history.Obs`.
         cache: "ram" and "mmap" (files that processes share) decode the selection once for all batches, "stream" reads
             the chunks that a batch needs, "auto" chooses by size and free memory. All modes return the same batches.
-            See `sources.CACHE_MODES`.
+            See `sources.CacheMode`.
         threads: number of threads that decode and render; by default one for each usable core.
         channels: channels of observations: "own", which differ between layouts, or "canonical", the union of all
             layouts' channels, for batches that mix layouts; see `overcooked.channels`. With obs="state", call

@@ -17,15 +17,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import (
-    ALL_TRACKS,
-    LABEL_VIEWS,
-    SOURCES,
-    SPLITS,
-    all_families,
-    check_family,
-    check_membership,
-)
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, LABEL_VIEWS, SOURCES, SPLITS, check_family, check_membership
 from icrl4aht_data.errors import (
     EmptySelectionError,
     Icrl4ahtError,
@@ -269,9 +261,12 @@ class Index:
         if name == "layout":
             return get_layout(str(value)).name
         if value in (own := [one for one in self.values(name) if one]):
-            return value  # saves time, since `all_families` searches the installed packages
-        known = {"split": SPLITS, "track": ALL_TRACKS, "source": SOURCES, "label_view": LABEL_VIEWS}.get(name, ())
-        check_choice(given, value, (*known, *(all_families() if name == "teammate_family" else ()), *own))
+            return value  # saves time, since `check_family` searches the installed packages
+        if name == "teammate_family":
+            check_family(value)
+        else:
+            known = {"split": SPLITS, "track": ALL_TRACKS, "source": SOURCES, "label_view": LABEL_VIEWS}.get(name, ())
+            check_choice(given, value, (*known, *own))
         return value
 
 

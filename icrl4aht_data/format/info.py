@@ -67,8 +67,7 @@ class EpisodeLengths(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     kept_steps: _Steps
 
 
-@dataclass(frozen=True)
-class LayoutSummary:
+class LayoutSummary(msgspec.Struct, frozen=True):
     """Summary of the histories of a release on one layout.
 
     Args:
@@ -92,8 +91,7 @@ class LayoutSummary:
     mean_final_return: float
 
 
-@dataclass(frozen=True)
-class LayoutStatistics:
+class LayoutStatistics(msgspec.Struct, frozen=True):
     """One column of the paper's table "Dataset statistics per layout".
 
     Args:

@@ -21,7 +21,6 @@ from icrl4aht_data.utils.system import new_array
 from icrl4aht_data.utils.text import counted_noun
 
 Obs = Literal["float32", "uint8", "state"]
-OBS: tuple[Obs, ...] = ("float32", "uint8", "state")
 """Values of the option `obs`: observations as float32 (the paper's dtype) or uint8 (the same integers), or
 state records, which `icrl4aht_data.overcooked.observe` renders as observations."""
 
@@ -42,7 +41,7 @@ class History(FieldArrays):
     Args:
         entry: the history's entry of the index.
         open_shard: function from a shard's name to the opened shard, called on first access of a field.
-        obs: form of the observations in `History.obs`; see `OBS`.
+        obs: form of the observations in `History.obs`; see `Obs`.
         channels: channels of `History.obs`, "own" (of the layout) or "canonical"; see `channels.CHANNELS`.
 
     Attributes:

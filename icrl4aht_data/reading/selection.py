@@ -15,28 +15,19 @@ from icrl4aht_data.errors import (
     OptionError,
     PositionTypeError,
     UnknownNameError,
-    check_choice,
     unknown,
 )
 from icrl4aht_data.fetch import ReleaseLocation
 from icrl4aht_data.format.index import ALIASES, Index
 from icrl4aht_data.format.provenance import ProvenanceByTask, read_provenance
 from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, KINDS, PROVENANCE, TEXTS, Entry
-from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
+from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.reading.history import LABELS, OBS, History, Labels, Obs
+from icrl4aht_data.reading.history import LABELS, History, Labels, Obs
 from icrl4aht_data.reading.shard import Shards
-from icrl4aht_data.reading.sources import (
-    CACHE_MODES,
-    CacheChoice,
-    CacheMode,
-    HistorySource,
-    choose_cache,
-    decoded_size,
-    open_source,
-)
+from icrl4aht_data.reading.sources import CacheChoice, CacheMode, HistorySource, choose_cache, decoded_size, open_source
 from icrl4aht_data.utils.install_hints import import_optional
-from icrl4aht_data.utils.options import check_int, check_number, check_position
+from icrl4aht_data.utils.options import check_int, check_number, check_options, check_position
 from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_data.utils.text import counted_histories, counted_noun, listed_names
 
@@ -55,8 +46,8 @@ class ReadOptions:
     """Options for reading histories.
 
     Args:
-        obs: form of observations; see `history.OBS`.
-        cache: cache mode of samplers; see `sources.CACHE_MODES`.
+        obs: form of observations; see `history.Obs`.
+        cache: cache mode of samplers; see `sources.CacheMode`.
         threads: number of threads that decode and render; by default one for each usable core.
         channels: channels of observations; see `channels.CHANNELS`.
 
@@ -70,9 +61,7 @@ class ReadOptions:
     channels: Channels = "own"
 
     def __post_init__(self) -> None:
-        check_choice("obs", self.obs, OBS)
-        check_choice("cache", self.cache, CACHE_MODES)
-        check_choice("channels", self.channels, CHANNELS)
+        check_options(self)
         check_int("threads", self.threads, 1)
 
 
@@ -96,7 +85,7 @@ class Selection:
         origin: location of the release, a `fetch.Remote` for a remote release.
         root: the release's folder on this machine; for a remote release the folder of downloaded files.
         options: form and channels of observations, cache mode, threads.
-        obs: form of observations: "float32", "uint8" or "state"; see `history.OBS`.
+        obs: form of observations: "float32", "uint8" or "state"; see `history.Obs`.
         channels: channels of observations, "own" (of each layout) or "canonical"; see `channels.CHANNELS`.
         threads: number of threads that decode and render.
 
@@ -316,7 +305,7 @@ class Selection:
 
     @cached_property
     def cache(self) -> CacheChoice:
-        """The cache mode that samplers use for this selection, and the reason; see `sources.CACHE_MODES`."""
+        """The cache mode that samplers use for this selection, and the reason; see `sources.CacheMode`."""
         # Sizes come from columns, since making 82,000 entries would take longer than opening the release.
         size = 0
         for number, layout in enumerate(self.layouts):

@@ -24,7 +24,6 @@ from icrl4aht_data.reading.shard import Shard, Shards
 from icrl4aht_data.utils.system import free_memory, gigabytes, run_in_slices
 
 CacheMode = Literal["auto", "ram", "mmap", "stream"]
-CACHE_MODES: tuple[CacheMode, ...] = ("auto", "ram", "mmap", "stream")
 """Cache modes; "auto" chooses the first of ram, mmap and stream for which the machine has enough space."""
 
 _VERSION = 2  # version of the memory-mapped arrays' format

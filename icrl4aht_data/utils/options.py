@@ -100,7 +100,7 @@ def convert_option(name: str, value: Any, hint: Any, strict: bool = True) -> Any
         UnknownNameError: if the value is not among the choices.
     """
     choices = option_choices(hint)
-    if choices and value is not None and value not in choices:
+    if choices and value not in choices and (value is not None or type(None) not in annotation_parts(hint)):
         raise unknown(name, value, choices)
     try:
         converted = msgspec.convert(value, hint, strict=strict)

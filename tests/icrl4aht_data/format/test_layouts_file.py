@@ -100,9 +100,8 @@ class TestReleaseWithLayouts:
         ds = pickle.loads(sent)
         assert ds[-1].obs.shape == (120, 5, 5, 35) and get_layout("mine-3-5").rows == ROWS
 
-    def test_release_of_published_layouts_has_no_layouts_file(self, tmp_path):
-        random_release(tmp_path / "plain", layouts=("coord_simple",), teammates=1, streams=1)
-        assert not (tmp_path / "plain" / LAYOUTS_FILE).exists()
+    def test_release_of_published_layouts_has_no_layouts_file(self, lite):
+        assert not (lite[0] / LAYOUTS_FILE).exists()
 
     @pytest.mark.parametrize(
         ("fields", "message"),

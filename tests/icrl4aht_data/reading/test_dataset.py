@@ -141,12 +141,6 @@ def test_environment_parameters_and_teammate_of_a_history_are_returned(lite):
     assert (teammate["kind"], teammate["family"], teammate["theta_id"]) == ("heuristic", "utility_greedy", 0)
 
 
-def test_returns_are_the_sums_of_rewards_per_episode(lite):
-    root, written = lite
-    expected = written[3]["rewards"].reshape(6, 20).sum(axis=1)
-    np.testing.assert_allclose(load_icrl4aht(root)[3].returns(), expected, rtol=0, atol=1e-9)
-
-
 def test_invalid_history_ids_raise_errors(lite):
     dataset = load_icrl4aht(lite[0])
     wrong_ids: list[Any] = ["x", 1.5, None]

@@ -16,7 +16,6 @@ from icrl4aht_data.errors import (
     PositionTypeError,
     UnknownNameError,
 )
-from icrl4aht_data.writing.convert import to_release
 
 
 @pytest.fixture(scope="module")
@@ -93,10 +92,9 @@ class TestAnimations:
         with pytest.raises((OptionError, PositionError), match=r"expected an integer|expected a number from -6 to 5"):
             dataset[6].animate(episode)
 
-    def test_animate_needs_state_records(self, full, tmp_path):
-        to_release(load_icrl4aht(full[0]), tmp_path / "o", "observations")
+    def test_animate_needs_state_records(self, converted_release):
         with pytest.raises(NotStoredError, match="this release has observations only"):
-            load_icrl4aht(tmp_path / "o")[0].animate()
+            load_icrl4aht(converted_release)[0].animate()
 
 
 class TestSplit:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -24,11 +24,8 @@ def increment_slowly(folder: Path, times: int) -> None:
 
 def test_lock_excludes_other_threads_although_its_file_is_removed(tmp_path):
     (tmp_path / "number.txt").write_text("0")
-    threads = [threading.Thread(target=increment_slowly, args=(tmp_path, 25)) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: increment_slowly(tmp_path, 25), range(4)))
     assert (tmp_path / "number.txt").read_text() == "100"
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["below", "locks", "number.txt"]
 

@@ -28,13 +28,6 @@ OTHER_ALIAS = Layout("other_alias", "other_alias_v1", ROWS)
 SPICY = Layout("spicy_room", "spicy_room", ("WW0WWWW", "W     W", "W APA B", "W     W", "WW7RXWW"), ((0, 0, 7),))
 NAME = "plain_room"
 """
-LAYOUT_POINTS = {
-    "plain_room": "rooms.maps:PLAIN",
-    "spicy_room": "rooms.maps:SPICY",
-    "broken_room": "rooms.missing:ROOM",
-    "text_room": "rooms.maps:NAME",
-    "other_alias": "rooms.maps:OTHER_ALIAS",
-}
 METHODS = """
 import dataclasses
 
@@ -53,7 +46,13 @@ def nothing(options, world):
 number = 3
 """
 POINTS = {
-    "icrl4aht.layouts": LAYOUT_POINTS,
+    "icrl4aht.layouts": {
+        "plain_room": "rooms.maps:PLAIN",
+        "spicy_room": "rooms.maps:SPICY",
+        "broken_room": "rooms.missing:ROOM",
+        "text_room": "rooms.maps:NAME",
+        "other_alias": "rooms.maps:OTHER_ALIAS",
+    },
     "icrl4aht.teammates": {"greedy_too": "rooms.methods:GREEDY"},
     "icrl4aht.methods": {
         "my_ad": "rooms.methods:renamed",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from rich.progress import Progress
@@ -69,9 +70,6 @@ def test_progress_bars_are_shown_on_terminals(monkeypatch, capsys):
 def test_threads_can_advance_one_progress_bar():
     shown = []
     advance = counted(lambda *bar: shown.append(bar), "x", 400)
-    threads = [threading.Thread(target=lambda: [advance(1) for _ in range(100)]) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(advance, [1] * 400))
     assert shown == [("x", done, 400) for done in range(401)]
