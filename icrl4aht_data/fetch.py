@@ -35,12 +35,11 @@ from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import check_against_manifest, parse_manifest, read_manifest
-from icrl4aht_data.format.schema import HISTORIES, INFO, LAYOUTS_FILE, MANIFEST, PARQUET_EPISODES, PROVENANCE, TASKS
+from icrl4aht_data.format.schema import INDEX_FILES, MANIFEST, PARQUET_EPISODES
 from icrl4aht_data.utils import files as disk
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.utils.system import data_folder
 
-_INDEX_FILES = (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE)  # files that are read when a release is opened
 _HUB = re.compile(r"hf://datasets/(?P<repo>[\w.-]+/[\w.-]+)(?:@(?P<revision>[^@]+))?/?")
 
 
@@ -284,7 +283,7 @@ def open_remote(url: str, to: Path | None = None) -> Remote:
         found = without_credentials(url)
         raise OptionError(f"{found}: expected an address such as hf://datasets/<org>/<repo>, s3://... or https://...")
     remote = (_open_hub if url.startswith("hf://") else _open_address)(url, to)
-    remote.fetch([name for name in _INDEX_FILES if name in remote.manifest])
+    remote.fetch([name for name in INDEX_FILES if name in remote.manifest])
     return remote
 
 

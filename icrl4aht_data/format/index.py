@@ -25,7 +25,6 @@ from icrl4aht_data.errors import (
     OptionError,
     UnknownNameError,
     check_choice,
-    unknown,
 )
 from icrl4aht_data.format.info import ReleaseInfo, read_info
 from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_layouts_stored, read_layouts
@@ -227,8 +226,7 @@ class Index:
         matching = np.ones(len(self.entries), bool)
         for given, value in filters.items():
             name = ALIASES.get(given, given)
-            if name not in (*QUERY_FIELDS, LAYOUT_FAMILY):
-                raise unknown("filter", given, (*QUERY_FIELDS, LAYOUT_FAMILY, *ALIASES))
+            check_choice("filter", given, (*QUERY_FIELDS, LAYOUT_FAMILY, *ALIASES))
             if isinstance(value, Mapping):
                 raise OptionError(f"{given} = {value!r}: expected a name or a sequence of names")
             names = [value] if isinstance(value, str) or not isinstance(value, Iterable) else value

@@ -13,28 +13,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 from icrl4aht_data.errors import ChunkTableError, IndexFormatError, UnsafePathError
-from icrl4aht_data.format.schema import (
-    EXPERTS,
-    HISTORIES,
-    INFO,
-    LAYOUTS_FILE,
-    MANIFEST,
-    PARQUET_EPISODES,
-    PARQUET_INDEX,
-    PROVENANCE,
-    TASKS,
-    TEAMMATES,
-)
-from icrl4aht_data.utils.files import (
-    LARGEST,
-    atomic_write,
-    check_file_size,
-    file_hash,
-    is_safe_path,
-    read_text,
-    resolve_inside,
-    wrap_read_errors,
-)
+from icrl4aht_data.format.schema import EXPERTS, INDEX_FILES, MANIFEST, PARQUET_EPISODES, PARQUET_INDEX, TEAMMATES
+from icrl4aht_data.utils.files import atomic_write, checked_hash, file_hash, is_safe_path, read_text, resolve_inside
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
@@ -122,12 +102,10 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
         path = resolve_inside(root, name)
         kind = ChunkTableError if name.startswith("meta/chunks/") else IndexFormatError
         try:
-            with wrap_read_errors(path):
-                check_file_size(path, LARGEST)
-                found = file_hash(path) if name in listed else None
+            found = checked_hash(path)
         except IndexFormatError as error:
             raise kind(str(error)) from error
-        if found is None:
+        if name not in listed:
             raise kind(f"{path}: {manifest} does not list this file; fetch the release again")
         if found != listed[name]:
             raise kind(
@@ -144,7 +122,7 @@ def check_meta(root: Path) -> None:
     names = {name for name in read_manifest(root) if re.fullmatch(r"meta/[^/]+", name)}
     if not (root / _SOURCE_CARD).exists():
         names.discard(_SOURCE_CARD)
-    names |= {name for name in (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE) if (root / name).exists()}
+    names |= {name for name in INDEX_FILES if (root / name).exists()}
     check_against_manifest(root, sorted(names))
 
 

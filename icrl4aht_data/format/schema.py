@@ -43,6 +43,9 @@ TASKS, PROVENANCE = "meta/tasks.jsonl", "meta/provenance.json"
 LAYOUTS_FILE = "meta/layouts.jsonl"
 """Path of the layouts stored in a release, see `layouts_file`; absent if the benchmark has all of its layouts."""
 
+INDEX_FILES = (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE)
+"""Files that are read when a release is opened."""
+
 TEAMMATES = "teammates"
 """Folder of the checkpoints of learned teammates."""
 

@@ -119,6 +119,17 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def checked_hash(path: Path) -> str:
+    """Return the SHA-256 of a file of at most `LARGEST` bytes as hexadecimal digits.
+
+    Raises:
+        IndexFormatError: if the file is missing, not a regular file, too large or unreadable.
+    """
+    check_file_size(path, LARGEST)
+    with wrap_read_errors(path):
+        return file_hash(path)
+
+
 def have_hashes(folder: Path, files: Mapping[str, str]) -> bool:
     """Return whether all files of a folder (path -> SHA-256) have the given hashes.
 
