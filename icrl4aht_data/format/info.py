@@ -26,16 +26,7 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.format.layouts_file import read_layouts
 from icrl4aht_data.format.provenance import ProvenanceByTask
-from icrl4aht_data.format.schema import (
-    FORMAT_VERSION,
-    INFO,
-    READABLE_VERSIONS,
-    Entry,
-    FiniteNumber,
-    Kind,
-    StreamCount,
-    check_name,
-)
+from icrl4aht_data.format.schema import INFO, READABLE_VERSIONS, Entry, FiniteNumber, Kind, StreamCount, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text, resolve_inside
@@ -234,7 +225,7 @@ def read_info(root: Path) -> ReleaseInfo:
     except IndexFormatError as error:
         raise IndexFormatError(f"{path}: malformed: {error}") from error
     found = f"{path}: format version {version}, this package reads {', '.join(map(str, READABLE_VERSIONS))}"
-    if version > FORMAT_VERSION:
+    if version > max(READABLE_VERSIONS):
         raise FormatTooNewError(f"{found}: update the package with `pip install -U {PACKAGE}`")
     raise FormatTooOldError(f"{found}: fetch a newer version of the release")
 
@@ -249,9 +240,7 @@ def check_version(version: str) -> None:
         raise OptionError(f"data version {version!r:.100}: expected a SemVer version such as 1.0.0 or 1.0.0-rc.1")
 
 
-def make_info(
-    kind: Kind, data_version: str, kept_steps: int, entries: list[Entry], format_version: int = FORMAT_VERSION
-) -> ReleaseInfo:
+def make_info(kind: Kind, data_version: str, kept_steps: int, entries: list[Entry], format_version: int) -> ReleaseInfo:
     """Return the `ReleaseInfo` of a release with the given entries, without shard sizes and statistics."""
     layouts = {}
     for name, members in grouped(entries, lambda entry: entry.layout).items():

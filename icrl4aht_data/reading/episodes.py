@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Self, overload
 
 import numpy as np
 
-from icrl4aht_data.errors import PositionTypeError
-from icrl4aht_data.utils.options import check_position
+from icrl4aht_data.utils.options import check_position, take_slice
 
 if TYPE_CHECKING:
     from icrl4aht_data.reading.history import History
@@ -156,10 +155,7 @@ class Episodes(Sequence[Episode]):
 
     def __getitem__(self, position: int | slice) -> Episode | Self:
         if isinstance(position, slice):
-            try:
-                return type(self)(self._history, self.numbers[position])
-            except TypeError as error:
-                raise PositionTypeError(f"{position!r}: expected integers in a slice of episodes") from error
+            return type(self)(self._history, take_slice(self.numbers, position, "episodes"))
         return Episode(self._history, self.numbers[check_position(repr(self), position, len(self))])
 
     def __iter__(self) -> Iterator[Episode]:

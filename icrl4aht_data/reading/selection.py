@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Any, Self, overload
 
 import numpy as np
 
-from icrl4aht_data.errors import (
-    EmptySelectionError,
-    NotStoredError,
-    OptionError,
-    PositionTypeError,
-    UnknownNameError,
-    unknown,
-)
+from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, check_choice
 from icrl4aht_data.fetch import ReleaseLocation
 from icrl4aht_data.format.index import ALIASES, Index
 from icrl4aht_data.format.provenance import ProvenanceByTask, read_provenance
@@ -27,7 +20,7 @@ from icrl4aht_data.reading.history import LABELS, History, Labels, Obs
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheChoice, CacheMode, HistorySource, choose_cache, decoded_size, open_source
 from icrl4aht_data.utils.install_hints import import_optional
-from icrl4aht_data.utils.options import check_int, check_number, check_options, check_position
+from icrl4aht_data.utils.options import check_int, check_number, check_options, check_position, take_slice
 from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_data.utils.text import counted_histories, counted_noun, listed_names
 
@@ -158,10 +151,7 @@ class Selection:
 
     def __getitem__(self, position: int | slice) -> History | Self:
         if isinstance(position, slice):
-            try:
-                return self.select(self.ids[position])
-            except TypeError as error:
-                raise PositionTypeError(f"{position!r}: expected integers in a slice of histories") from error
+            return self.select(take_slice(self.ids, position, "histories"))
         return self.history(int(self.ids[check_position("the selection's histories", position, len(self))]))
 
     def __iter__(self) -> Iterator[History]:
@@ -204,8 +194,7 @@ class Selection:
             found = {kind: int(self.has_labels(kind).sum()) for kind in LABELS}
             return {kind: number for kind, number in found.items() if number}
         field = ALIASES.get(name, name)
-        if ENTRY_HINTS.get(field) not in TEXTS:
-            raise unknown("field of names", name, ("labels", *(one for one, of in ENTRY_HINTS.items() if of in TEXTS)))
+        check_choice("field of names", field, ("labels", *(one for one, of in ENTRY_HINTS.items() if of in TEXTS)))
         # Codes are positions in the values of the release, so some values may be absent from this selection.
         numbers = np.bincount(self.column_codes(field), minlength=1).tolist()
         found = zip(self.index.values(field), numbers, strict=False)
@@ -247,9 +236,8 @@ class Selection:
         Raises:
             UnknownNameError: if there is no such field; the message suggests the nearest name.
         """
-        name = ALIASES.get(name, name) if isinstance(name, str) else name
-        if not isinstance(name, str) or name not in ENTRY_HINTS:
-            raise unknown("column", name, (*ENTRY_HINTS, *ALIASES))
+        check_choice("column", name, (*ENTRY_HINTS, *ALIASES))
+        name = ALIASES.get(name, name)
         # The index has no columns of ids and shapes, which follow from the position and the layout.
         if name == "history_id":
             return self.ids.astype(np.int64)

@@ -37,6 +37,7 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 ShareBelowOne = Annotated[float, Meta(ge=0, lt=1)]
 
 Options = TypeVar("Options")
+Sliceable = TypeVar("Sliceable", range, np.ndarray)
 
 
 class Option(NamedTuple):
@@ -180,6 +181,23 @@ def check_number(name: str, value: Any, hint: Any = float) -> float:
         OptionError: if the value is not a finite number within the bounds; the message has the option's name.
     """
     return convert_option(name, value.item() if isinstance(value, np.generic) else value, hint)
+
+
+def take_slice(items: Sliceable, position: slice, what: str) -> Sliceable:
+    """Return the items at a slice.
+
+    Args:
+        items: a sequence or an array.
+        position: the slice.
+        what: the items in words, such as "episodes", for the message.
+
+    Raises:
+        PositionTypeError: if a bound of the slice is not an integer.
+    """
+    try:
+        return items[position]
+    except TypeError as error:
+        raise PositionTypeError(f"{position!r}: expected integers in a slice of {what}") from error
 
 
 def check_position(sequence: str, position: Any, count: int) -> int:

@@ -22,6 +22,7 @@ from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask
 from icrl4aht_data.format.schema import (
     ALL_KINDS,
+    FORMAT_VERSION,
     HISTORIES,
     INFO,
     KINDS,
@@ -172,7 +173,7 @@ def write_release(
         content = {task_id: of_task.to_json() for task_id, of_task in provenance.items()}
         write_json(root / PROVENANCE, content, indent=None)  # a task takes a kilobyte even without indentation
         sizes = {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in writer.entries)}
-        info = make_info(kind, data_version, kept_steps, writer.entries)
+        info = make_info(kind, data_version, kept_steps, writer.entries, FORMAT_VERSION)
         statistics = layout_statistics(info, writer.entries, known, provenance, sizes)
         info = replace(info, shards=sizes, statistics=statistics, left_out=list(left_out))
         write_json(root / INFO, info.to_json())
