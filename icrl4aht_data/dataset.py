@@ -126,8 +126,7 @@ def open_dataset(location: ReleaseLocation, options: ReadOptions) -> Dataset:
     """Return a dataset of all histories of a release; see `load_icrl4aht` for the errors."""
     if os.path.isfile(location.folder / INFO):  # noqa: PTH113 - never raises; `read_index` reports a missing file
         check_meta(location.folder)
-    index = read_index(location.folder)
-    return Dataset(location, index, Shards(location, index), options)
+    return Dataset(Shards(location, read_index(location.folder)), options)
 
 
 class Dataset(Selection):

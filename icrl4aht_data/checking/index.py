@@ -109,12 +109,11 @@ def _check_info(index: Index, tasks: list[Task], provenance: ProvenanceByTask | 
     root, info, shards = index.root, index.info, index.values("shard")
     entries = list(index.entries)
     described = make_info(info.kind, info.data_version, info.environment.kept_steps, entries, info.format_version)
-    described = replace(described, left_out=info.left_out)
+    described = replace(described, left_out=info.left_out, shards=info.shards)
     if info.shards.keys() != set(shards):
         report.add(INFO, f"shards: expected {sorted(shards)}, found {sorted(info.shards)}")
     elif report.ok and provenance is not None:
-        statistics = layout_statistics(described, entries, tasks, provenance, info.shards)
-        described = replace(described, shards=info.shards, statistics=statistics)
+        described = replace(described, statistics=layout_statistics(described, entries, tasks, provenance))
     found = parse_json(read_text(resolve_inside(root, INFO)))  # may have unknown fields
     for name in sorted(found.keys() - {field.name for field in fields(ReleaseInfo)}):
         report.add(INFO, f"{name}: an unknown field")

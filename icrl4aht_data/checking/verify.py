@@ -27,7 +27,7 @@ from icrl4aht_data.format.schema import KINDS, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import FilterValues
-from icrl4aht_data.reading.shard import Shard
+from icrl4aht_data.reading.shard import ChunkCache, Shard
 from icrl4aht_data.utils.files import resolve_inside
 from icrl4aht_data.utils.groups import grouped
 
@@ -155,7 +155,7 @@ def _check_shards(
     for name in shards:
         entries = members[name]
         try:
-            shard = Shard(local, name, index.info, entries)
+            shard = Shard(local, name, index.info, entries, ChunkCache())
         except Icrl4ahtError as error:
             report.add(name, str(error))
             continue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from operator import mul
 from pathlib import Path
@@ -269,20 +269,15 @@ def make_info(kind: Kind, data_version: str, kept_steps: int, entries: list[Entr
 
 
 def layout_statistics(
-    described: ReleaseInfo,
-    entries: Sequence[Entry],
-    tasks: Sequence[Task],
-    provenance: ProvenanceByTask,
-    sizes: Mapping[str, int],
+    described: ReleaseInfo, entries: Sequence[Entry], tasks: Sequence[Task], provenance: ProvenanceByTask
 ) -> dict[str, LayoutStatistics]:
     """Return the statistics of every layout, in order of first appearance.
 
     Args:
-        described: result of `make_info` for the entries.
+        described: result of `make_info` for the entries, with the sizes of the shards.
         entries: entries of the release's index.
         tasks: the release's tasks.
         provenance: how the histories of each task were made, by task id.
-        sizes: sizes of the shards in bytes, by path.
     """
     statistics = {}
     for layout, members in grouped(entries, lambda entry: entry.layout).items():
@@ -303,7 +298,7 @@ def layout_statistics(
             actions=len(ACTIONS),
             mean_final_return=summary.mean_final_return,
             independent_teammates=len(set(map(_policy_key, own))) or None,
-            disk_bytes=sum(sizes[shard] for shard in {entry.shard for entry in members}),
+            disk_bytes=sum(described.shards[shard] for shard in {entry.shard for entry in members}),
         )
     return statistics
 

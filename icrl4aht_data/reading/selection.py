@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Self, overload
 import numpy as np
 
 from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, check_choice
-from icrl4aht_data.fetch import ReleaseLocation
-from icrl4aht_data.format.index import ALIASES, Index
+from icrl4aht_data.format.index import ALIASES
 from icrl4aht_data.format.provenance import ProvenanceByTask, read_provenance
 from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, KINDS, PROVENANCE, TEXTS, Entry
 from icrl4aht_data.overcooked.channels import Channels, observation_shape
@@ -65,9 +64,7 @@ class Selection:
     selection. Selections of one release share its index and opened shards.
 
     Args:
-        location: location of the release.
-        index: the release's index.
-        shards: the release's opened shards.
+        shards: the release's shards, with its location and index.
         options: reading options.
         ids: int (H,), the histories' ids; all of the release by default.
 
@@ -86,29 +83,22 @@ class Selection:
         OptionError: if obs="state" and the release has no state records.
     """
 
-    def __init__(
-        self,
-        location: ReleaseLocation,
-        index: Index,
-        shards: Shards,
-        options: ReadOptions,
-        ids: np.ndarray | None = None,
-    ) -> None:
-        self.origin, self.root, self._shards = location, location.folder, shards
-        self.index, self.info = index, index.info
+    def __init__(self, shards: Shards, options: ReadOptions, ids: np.ndarray | None = None) -> None:
+        self._shards, self.origin, self.root = shards, shards.location, shards.location.folder
+        self.index, self.info = shards.index, shards.index.info
         self.options, self.threads = options, options.threads
         self.obs: Obs = options.obs
         self.channels: Channels = options.channels
-        self.ids = np.arange(len(index.entries)) if ids is None else ids
+        self.ids = np.arange(len(self.index.entries)) if ids is None else ids
         self._source: HistorySource | None = None
         if self.obs == "state" and not self.has_states:
             raise OptionError(
-                f'obs = "state": {location} has observations only, no state records; use float32 or uint8'
+                f'obs = "state": {self.origin} has observations only, no state records; use float32 or uint8'
             )
 
     # The pickle for workers of a data loader omits decoded arrays: each worker opens a new source.
     def __getstate__(self) -> tuple:
-        return self.origin, self.index, self._shards, self.options, self.ids
+        return self._shards, self.options, self.ids
 
     def __setstate__(self, state: tuple) -> None:
         self.__init__(*state)
@@ -329,7 +319,7 @@ class Selection:
         changed: dict[str, Any] = {"obs": obs, "cache": cache, "threads": threads, "channels": channels}
         # `replace` creates new options, which check themselves.
         options = replace(self.options, **{name: value for name, value in changed.items() if value is not None})
-        return type(self)(self.origin, self.index, self._shards, options, self.ids)
+        return type(self)(self._shards, options, self.ids)
 
     def filter(
         self,
@@ -428,4 +418,4 @@ class Selection:
             raise UnknownNameError(
                 f"{self.root}: this selection has no history {absent.tolist()}, its ids are within {within}: {self!r}"
             )
-        return type(self)(self.origin, self.index, self._shards, self.options, chosen)
+        return type(self)(self._shards, self.options, chosen)

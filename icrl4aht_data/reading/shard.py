@@ -75,7 +75,7 @@ class Shard:
         name: path of the shard in the release.
         info: the release's info.
         entries: all histories of the shard, in index order.
-        cache: decoded chunks, shared with other shards; a new cache by default.
+        cache: decoded chunks, shared with other shards.
 
     Attributes:
         entries: history id -> index entry.
@@ -89,19 +89,14 @@ class Shard:
     """
 
     def __init__(
-        self,
-        location: ReleaseLocation,
-        name: str,
-        info: ReleaseInfo,
-        entries: Sequence[Entry],
-        cache: ChunkCache | None = None,
+        self, location: ReleaseLocation, name: str, info: ReleaseInfo, entries: Sequence[Entry], cache: ChunkCache
     ) -> None:
         self.path, self.name = location.path(name), name
         self.kind: Kind = info.kind
         self.format_version = info.format_version
         self.layout = get_layout(entries[0].layout)
         self.entries = {entry.history_id: entry for entry in entries}
-        self._cache = cache or ChunkCache()
+        self._cache = cache
         self._elements = {field.name: field.element(self.layout, self.kind) for field in FIELDS.values()}
         self._first: dict[tuple[int, str], int] = {}  # (history id, field) -> row of its first chunk in the table
         location.fetch([chunk_table_name(name), name])
@@ -278,19 +273,19 @@ class Shards:
     """
 
     def __init__(self, location: ReleaseLocation, index: Index) -> None:
-        self._location, self._index = location, index
+        self.location, self.index = location, index
         self._open: dict[str, Shard] = {}
         self.cache = ChunkCache()
 
     def open(self, name: str) -> Shard:
         """Return the shard with this path in the release; a shard of a remote release is downloaded first."""
         if name not in self._open:
-            entries = self._index.entries
+            entries = self.index.entries
             members = [entries[row] for row in np.flatnonzero(entries.matches("shard", [name])).tolist()]
-            self._open[name] = Shard(self._location, name, self._index.info, members, self.cache)
+            self._open[name] = Shard(self.location, name, self.index.info, members, self.cache)
         return self._open[name]
 
     def fetch(self, names: Iterable[str]) -> None:
         """Download shards of a remote release and their chunk tables in parallel."""
         closed = [name for name in dict.fromkeys(names) if name not in self._open]
-        self._location.fetch([*map(chunk_table_name, closed), *closed])
+        self.location.fetch([*map(chunk_table_name, closed), *closed])

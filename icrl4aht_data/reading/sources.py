@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -111,10 +112,7 @@ def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: i
         digest.update(f" {entry.T} {entry.episodes} ".encode() + shard.fingerprint(entry.history_id))
 
     def build(folder: Path) -> None:
-        def make(shape: tuple[int, ...], dtype: np.dtype, name: str) -> np.memmap:
-            return new_mapped_array(folder / f"{name}.npy", shape, dtype)
-
-        for array in _decode(entries, shards, threads, make).values():
+        for array in _decode(entries, shards, threads, folder).values():
             array.flush()  # type: ignore[attr-defined]
 
     steps, episodes = sum(entry.T for entry in entries), sum(entry.episodes for entry in entries)
@@ -123,18 +121,16 @@ def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: i
 
 
 def _decode(
-    entries: Sequence[Entry],
-    shards: Sequence[Shard],
-    threads: int,
-    make: Callable[..., np.ndarray] = lambda shape, dtype, name: np.zeros(shape, dtype),
+    entries: Sequence[Entry], shards: Sequence[Shard], threads: int, folder: Path | None = None
 ) -> dict[str, np.ndarray]:
-    """Decode one layout's histories to field -> array (rows, ...); `make(shape, dtype, name)` allocates zeros."""
+    """Decode one layout's histories to field -> array (rows, ...), in memory or memory-mapped in files of a folder."""
     arrays = {}
     for field in memory_fields(shards[0].kind):
         if any(entry.has(field) for entry in entries):
             rows = sum(entry.rows(field) for entry in entries) + (len(entries) + 1 if field.axis == "T" else 0)
             element = field.memory_dtype(shards[0].layout)
-            arrays[field.name] = make((rows, *element.shape), element.base, field.name)
+            allocate = np.zeros if folder is None else partial(new_mapped_array, folder / f"{field.name}.npy")
+            arrays[field.name] = allocate((rows, *element.shape), element.base)
     firsts = {axis: _first_rows(entries, axis) for axis in ("T", "E")}
 
     def decode(start: int, stop: int) -> None:

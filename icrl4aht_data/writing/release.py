@@ -174,8 +174,8 @@ def write_release(
         write_json(root / PROVENANCE, content, indent=None)  # a task takes a kilobyte even without indentation
         sizes = {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in writer.entries)}
         info = make_info(kind, data_version, kept_steps, writer.entries, FORMAT_VERSION)
-        statistics = layout_statistics(info, writer.entries, known, provenance, sizes)
-        info = replace(info, shards=sizes, statistics=statistics, left_out=list(left_out))
+        info = replace(info, shards=sizes, left_out=list(left_out))
+        info = replace(info, statistics=layout_statistics(info, writer.entries, known, provenance))
         write_json(root / INFO, info.to_json())
         if card is None:
             write_card(root)

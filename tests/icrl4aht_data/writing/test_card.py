@@ -85,7 +85,9 @@ def write_meta(lite, tmp_path) -> Callable[..., dict[str, Any]]:
                 changes |= of_task.entry_fields(like.episodes) | fields
                 entries.append(msgspec.structs.replace(like, **changes))
         (tmp_path / "meta").mkdir(exist_ok=True)
-        info = replace(make_info("lite", "1.0.0", 20, entries), left_out=[LEFT_OUT], shards={"data/x.h5": 1})
+        info = replace(
+            make_info("lite", "1.0.0", 20, entries, FORMAT_VERSION), left_out=[LEFT_OUT], shards={"data/x.h5": 1}
+        )
         write_json(tmp_path / INFO, info.to_json())
         (tmp_path / HISTORIES).write_text("".join(json.dumps(entry.to_json()) + "\n" for entry in entries))
         write_tasks(tmp_path / TASKS, [task for task, _, _ in tasks])
