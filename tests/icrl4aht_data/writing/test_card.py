@@ -21,7 +21,7 @@ from icrl4aht_data.format.provenance import (
     Provenance,
     ReferenceEgos,
 )
-from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, HISTORIES, INFO, PROVENANCE, TASKS
+from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, FORMAT_VERSION, HISTORIES, INFO, PROVENANCE, TASKS
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.writing.card import (
@@ -85,10 +85,8 @@ def write_meta(lite, tmp_path) -> Callable[..., dict[str, Any]]:
                 changes |= of_task.entry_fields(like.episodes) | fields
                 entries.append(msgspec.structs.replace(like, **changes))
         (tmp_path / "meta").mkdir(exist_ok=True)
-        info = replace(
-            make_info("lite", "1.0.0", 20, entries, FORMAT_VERSION), left_out=[LEFT_OUT], shards={"data/x.h5": 1}
-        )
-        write_json(tmp_path / INFO, info.to_json())
+        info = make_info("lite", "1.0.0", 20, entries, FORMAT_VERSION)
+        write_json(tmp_path / INFO, replace(info, left_out=[LEFT_OUT], shards={"data/x.h5": 1}).to_json())
         (tmp_path / HISTORIES).write_text("".join(json.dumps(entry.to_json()) + "\n" for entry in entries))
         write_tasks(tmp_path / TASKS, [task for task, _, _ in tasks])
         write_json(tmp_path / PROVENANCE, {task.task_id: change(of_task).to_json() for task, of_task, _ in tasks})
