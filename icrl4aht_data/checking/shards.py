@@ -15,17 +15,7 @@ from icrl4aht_data.errors import Icrl4ahtError, OptionError, ShardCorruptError
 from icrl4aht_data.format import safe_hdf5
 from icrl4aht_data.format.chunks import METADATA_ROW_BYTES, chunk_locations
 from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.schema import (
-    ACTION_FIELDS,
-    FIELDS,
-    KINDS,
-    Entry,
-    Field,
-    curve_fields,
-    episode_ends,
-    episode_returns,
-    record_field,
-)
+from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, KINDS, curve_fields, episode_ends, record_field
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
@@ -42,12 +32,13 @@ _COPIES = 4  # memory that checking a history takes, as a multiple of the size o
 def check_chunks(shard: Shard, report: Report) -> set[int]:
     """Decode every chunk of a shard, and return the ids of histories with a damaged chunk."""
     damaged = set()
-    for row, history_id, field in shard.chunks():
+    of_chunks = ((entry, field) for entry, field in shard.datasets for _ in range(entry.chunks(field)))
+    for row, (entry, field) in enumerate(of_chunks):
         try:
-            shard.decode(row, history_id, field)
+            shard.decode(row, entry.history_id, field)
         except Icrl4ahtError as error:
             report.add(shard.name, str(error))
-            damaged.add(history_id)
+            damaged.add(entry.history_id)
         report.chunks += 1
     return damaged
 
@@ -105,7 +96,7 @@ def _history_faults(history: History, layout: Layout, kept_steps: int, deep: boo
         for fault in faults(layout, history.read(name)):
             possible = False
             yield f"{name} has {fault}"
-    for name, value in curve_fields(episode_returns(rewards, dones)).items():
+    for name, value in curve_fields(history.returns()).items():
         if not np.isclose(value, getattr(entry, name), rtol=0, atol=1e-9):
             yield f"{name}: the index says {getattr(entry, name)}, the rewards give {value}"
     if deep and not has_states:
@@ -206,13 +197,17 @@ def _structure_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
         if stored != names:
             yield f"{group}: expected {sorted(names)}, found {sorted(stored)}"
             return
-    faults = [
-        fault
-        for entry in entries
-        for field in entry.stored_fields(shard.kind)
-        if (fault := _dataset_fault(shard, file, entry, field, groups[entry.h5_group]))
-    ]
-    yield from faults
+    faults = 0
+    for entry, field in shard.datasets:
+        dataset, rows = safe_hdf5.find_node(file, f"{entry.h5_group}/{field.name}"), entry.rows(field)
+        element, chunk = field.element(shard.layout, shard.kind), min(field.chunk, rows)
+        filters = [safe_hdf5.SHUFFLE] * (element.itemsize > 1) + [safe_hdf5.DEFLATE]
+        shapes = ((rows,), (chunk,)) if entry.h5_row is None else ((groups[entry.h5_group], rows), (1, chunk))
+        found = safe_hdf5.filter_ids(dataset), dataset.dtype, dataset.shape, dataset.chunks
+        if found != (filters, element, *shapes):
+            faults += 1
+            expected = f"expected filters, type, shape and chunks {(filters, element, *shapes)}"
+            yield f"{dataset.name}: {expected}, found {found}"
     if not faults:
         chunks = [chunk for entry in entries for chunk in chunk_locations(file, shard.kind, entry)]
         table = shard.table[["offset", "size", "rows"]][: len(chunks)].tolist()
@@ -221,27 +216,13 @@ def _structure_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
             yield f"the chunk table places {shard.describe(wrong[0])} where HDF5 has {chunks[wrong[0]]}"
 
 
-def _dataset_fault(shard: Shard, file: h5py.File, entry: Entry, field: Field, stacked: int) -> str | None:
-    """Return a fault in the storage of a dataset in a group with `stacked` histories; None if there is none."""
-    dataset, rows = safe_hdf5.find_node(file, f"{entry.h5_group}/{field.name}"), entry.rows(field)
-    element = field.element(shard.layout, shard.kind)
-    filters = [safe_hdf5.SHUFFLE] * (element.itemsize > 1) + [safe_hdf5.DEFLATE]
-    chunk = min(field.chunk, rows)
-    shapes = ((rows,), (chunk,)) if entry.h5_row is None else ((stacked, rows), (1, chunk))
-    found = safe_hdf5.filter_ids(dataset), dataset.dtype, dataset.shape, dataset.chunks
-    if found == (filters, element, *shapes):
-        return None
-    return f"{dataset.name}: expected filters, type, shape and chunks {(filters, element, *shapes)}, found {found}"
-
-
 def _value_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
-    for entry in shard.entries.values():
-        for field in entry.stored_fields(shard.kind):
-            dataset: Any = file[f"{entry.h5_group}/{field.name}"]
-            try:
-                ours = shard.read(entry.history_id, field, 0, entry.rows(field))
-            except ShardCorruptError:
-                continue  # the damage is already reported, and libhdf5 must not inflate the chunk
-            theirs = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
-            if not np.array_equal(theirs, ours):
-                yield f"history {entry.history_id}: HDF5 reads other values of {field.name} than we do"
+    for entry, field in shard.datasets:
+        dataset: Any = file[f"{entry.h5_group}/{field.name}"]
+        try:
+            ours = shard.read(entry.history_id, field, 0, entry.rows(field))
+        except ShardCorruptError:
+            continue  # the damage is already reported, and libhdf5 must not inflate the chunk
+        theirs = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
+        if not np.array_equal(theirs, ours):
+            yield f"history {entry.history_id}: HDF5 reads other values of {field.name} than we do"

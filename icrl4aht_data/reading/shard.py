@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -79,6 +79,7 @@ class Shard:
 
     Attributes:
         entries: history id -> index entry.
+        datasets: pairs (entry, field), the stored arrays in the order of their chunks in the chunk table.
         table: (N,), the chunk table, see `schema.CHUNK_DTYPE`.
         kind: the release's kind.
         format_version: the release's format version.
@@ -96,6 +97,7 @@ class Shard:
         self.format_version = info.format_version
         self.layout = get_layout(entries[0].layout)
         self.entries = {entry.history_id: entry for entry in entries}
+        self.datasets = [(entry, field) for entry in entries for field in entry.stored_fields(self.kind)]
         self._cache = cache
         self._elements = {field.name: field.element(self.layout, self.kind) for field in FIELDS.values()}
         self._first: dict[tuple[int, str], int] = {}  # (history id, field) -> row of its first chunk in the table
@@ -108,8 +110,7 @@ class Shard:
     def _check_table(self) -> None:
         """Check that the chunk table has the chunks and rows implied by the index, with possible sizes."""
         table = self.table
-        members = [(entry, field) for entry in self.entries.values() for field in entry.stored_fields(self.kind)]
-        chunks = [entry.chunks(field) for entry, field in members]
+        chunks = [entry.chunks(field) for entry, field in self.datasets]
         *firsts, total = np.cumsum([0, *chunks]).tolist()
         found = int(np.count_nonzero(table["rows"]))
         if found != total or not table["rows"][:total].all():
@@ -119,7 +120,7 @@ class Shard:
             )
         sums = np.add.reduceat(table["rows"][:total].astype(np.int64), firsts).tolist()
         sizes = []
-        for (entry, field), first, rows in zip(members, firsts, sums, strict=True):
+        for (entry, field), first, rows in zip(self.datasets, firsts, sums, strict=True):
             self._first[entry.history_id, field.name] = first
             if rows != entry.rows(field):
                 raise ShardMismatchError(
@@ -248,12 +249,6 @@ class Shard:
         first, chunks = self._first[history_id, stored[0].name], sum(map(entry.chunks, stored))
         names = " ".join(field.name for field in stored).encode()
         return names + self.table["hash"][first : first + chunks].tobytes()
-
-    def chunks(self) -> Iterator[tuple[int, int, Field]]:
-        """Yield (row in the chunk table, history id, field) for every chunk."""
-        for (history_id, name), first in self._first.items():
-            for number in range(self.entries[history_id].chunks(FIELDS[name])):
-                yield first + number, history_id, FIELDS[name]
 
     def describe(self, row: int) -> str:
         """Return a description of a chunk for messages, with its number, field, history and bytes."""
