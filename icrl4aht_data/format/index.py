@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import count, islice
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
@@ -37,10 +37,9 @@ _BLOCK = 2**12  # number of entries in memory at a time
 _DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int64, float | None: np.float64}
 # The fields `history_id` and `obs_shape` have no columns, since the row and the layout determine their values.
 _NUMBERS = {name: _DTYPES[hint] for name, hint in ENTRY_HINTS.items() if hint in _DTYPES and name != "history_id"}
-_ABSENT = {name: -1 for name, hint in ENTRY_HINTS.items() if hint == int | None}  # stands for None in a column
-_ABSENT |= {name: np.nan for name, hint in ENTRY_HINTS.items() if hint == float | None}
+_STAND_INS = {int | None: -1, float | None: np.nan}  # values that stand for None in columns; "" in string columns
 _STRINGS = tuple(name for name, hint in ENTRY_HINTS.items() if hint in TEXTS or name in ENCODED)
-_ABSENT |= {name: "" for name in _STRINGS if ENTRY_HINTS[name] is not str}
+_ABSENT = {name: _STAND_INS.get(hint, "") for name, hint in ENTRY_HINTS.items() if type(None) in get_args(hint)}
 _names = attrgetter(*_STRINGS)
 
 

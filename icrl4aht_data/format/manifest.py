@@ -36,6 +36,9 @@ _KNOWN = re.compile(
 content of a downloaded file such as .git/config, sitecustomize.py or x.pth."""
 
 
+META_FILE = re.compile(r"meta/[^/]+")
+"""Pattern of the files in meta/, except chunk tables. Opening a release checks their hashes."""
+
 _SOURCE_CARD = "meta/source_card.md"  # written only by earlier versions of this package
 
 
@@ -119,7 +122,7 @@ def check_meta(root: Path) -> None:
 
     meta/source_card.md, which earlier versions of this package wrote, may be missing, since no code reads this file.
     """
-    names = {name for name in read_manifest(root) if re.fullmatch(r"meta/[^/]+", name)}
+    names = {name for name in read_manifest(root) if META_FILE.fullmatch(name)}
     if not (root / _SOURCE_CARD).exists():
         names.discard(_SOURCE_CARD)
     names |= {name for name in INDEX_FILES if (root / name).exists()}

@@ -66,15 +66,13 @@ def choose_cache(cache: CacheMode, size: int) -> CacheChoice:
     """Return the cache mode for arrays of `size` bytes, and the reason for this mode."""
     if cache != "auto":
         return CacheChoice(cache, "set by the option `cache`")
-    memory = free_memory()
+    decoded, memory = f"{gigabytes(size)} decoded", free_memory()
     if size <= memory // 2:
-        return CacheChoice("ram", f"{gigabytes(size)} decoded, {gigabytes(memory)} of memory free")
+        return CacheChoice("ram", f"{decoded}, {gigabytes(memory)} of memory free")
     room = cacheable_bytes()
     if size <= room:
-        return CacheChoice(
-            "mmap", f"{gigabytes(size)} decoded, more than half of the {gigabytes(memory)} of memory free"
-        )
-    return CacheChoice("stream", f"{gigabytes(size)} decoded, room for {gigabytes(room)} in the cache folder")
+        return CacheChoice("mmap", f"{decoded}, more than half of the {gigabytes(memory)} of memory free")
+    return CacheChoice("stream", f"{decoded}, room for {gigabytes(room)} in the cache folder")
 
 
 def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episodes: int) -> int:
