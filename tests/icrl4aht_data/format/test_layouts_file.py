@@ -170,6 +170,8 @@ class TestRecipesOfATask:
         (task,) = make_tasks(["demo_wide"])
         with pytest.raises(TaskFormatError, match=message):
             parse_task(task_fields(task) | {"recipes": recipes})
+        with pytest.raises(TaskFormatError, match="no pile"):
+            make_tasks(["demo_wide"], recipes=((0, 0, 7),))
 
     def test_histories_and_verification_use_the_recipes_of_the_task(self, tmp_path):
         root = tmp_path / "release"
