@@ -130,6 +130,7 @@ def instance_entries(layout: Layout) -> list[dict[str, Any]]:
     return [entry for family in TESTED_FAMILIES for entry in published_teammates(tested, family)]
 
 
+@lru_cache(maxsize=2)
 def common_records(layout: Layout, episodes: int = _EPISODES) -> UInt8[Array, "T N S"]:
     """Return state records of episodes of the test instances, by family and instance.
 

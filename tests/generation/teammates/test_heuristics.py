@@ -88,36 +88,31 @@ def stacked(family: str, thetas: list[dict[str, Any]]) -> dict[str, np.ndarray]:
 
 
 @cache
-def compiled_episodes(family: str) -> Callable:
-    """Return a compiled function that plays episodes of a family's teammates as agent 1, with published noise."""
-    policy = build_teammate(None, published_teammates("test_simple", family)[0], noise="fixed")
-
-    def play_episode(params, record, recipes, tables):
-        def step(carry, recipe):
-            record, memory = carry
-            action, memory = policy.act(params, memory, Situation(tables, record), jax.random.key(0))
-            outcome = rules.step(tables, record, jnp.array([STAY, action]), recipe)
-            return (outcome.state, memory), (action, outcome.reward)
-
-        return jax.lax.scan(step, (record, policy.init(params, jax.random.key(99))), recipes)[1]
-
-    return jax.jit(jax.vmap(jax.vmap(play_episode, (None, 0, 1, None), 1), (0, None, None, None), 1))
-
-
-@cache
 def played(name: str, family: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return actions (100, 5, 129) and returns (5, 129) of t0..t4 as agent 1 with an ego that stays.
+    """Return actions (100, 5, 129) and returns (5, 129) of t0..t4 as agent 1, with published noise.
 
-    The last episode starts from the published state and has a constant recipe.
+    The ego always stays. The last episode starts from the published state and has a constant recipe.
     """
     layout, episodes = LAYOUTS[name], 128
+    entries = published_teammates(name, family)
+    policy = build_teammate(layout, entries[0], noise="fixed")
     records = jax.jit(Environment(layout).init)(jax.random.split(jax.random.key(7), episodes)).record
     pinned = state_record(layout, (1, 1, "up"), (5, 2, "up"))
     recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, episodes + 1))
     recipes[:, -1] = layout.recipe_items[0]
-    params = stacked(family, [entry["theta"] for entry in published_teammates(name, family)])
-    tables, records = padded(layout, np.concatenate([records, pinned]))
-    actions, rewards = compiled_episodes(family)(params, records, recipes, tables)
+
+    def play_episode(params, record, recipes):
+        def step(carry, recipe):
+            record, memory = carry
+            action, memory = policy.act(params, memory, record, jax.random.key(0))
+            outcome = rules.step(layout, record, jnp.array([STAY, action]), recipe)
+            return (outcome.state, memory), (action, outcome.reward)
+
+        return jax.lax.scan(step, (record, policy.init(params, jax.random.key(99))), recipes)[1]
+
+    run = jax.jit(jax.vmap(jax.vmap(play_episode, (None, 0, 1), 1), (0, None, None), 1))
+    params = stacked(family, [entry["theta"] for entry in entries])
+    actions, rewards = run(params, np.concatenate([records, pinned]), recipes)
     return np.asarray(actions), np.asarray(rewards.sum(axis=0))
 
 

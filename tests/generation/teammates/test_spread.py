@@ -34,7 +34,7 @@ from icrl4aht_generation.teammates.spread import (
 
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TESTED_ON
 from icrl4aht_data.benchmark.tasks import teammate_id
-from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
+from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 
 POINTS = np.array([0.0, 0.3, 0.35, 1.0, 0.05])
@@ -177,9 +177,3 @@ def test_random_actions_with_fixed_noise_repeat_in_every_episode():
     theta = {"a": 0.5, RANDOM_ACTIONS: 0.5}
     np.testing.assert_array_equal(actions_of(theta, "fixed", 1), actions_of(theta, "fixed", 2))
     assert (actions_of(theta, "seeded", 1) != actions_of(theta, "seeded", 2)).any()
-
-
-def test_probability_of_random_actions_above_1_raises_error():
-    entry = WATCHER | {"theta": WATCHER["theta"] | {RANDOM_ACTIONS: 1.5}}
-    with pytest.raises(TaskFormatError, match=r"expected `float` <= 1.0 - at `\$.random_actions`"):
-        check_theta(entry)
