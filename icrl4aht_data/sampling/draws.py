@@ -202,11 +202,9 @@ def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[n
     if episodes is None:
         return np.zeros_like(counts), counts
     try:
-        if not isinstance(episodes, tuple):
+        if not isinstance(episodes, tuple) or any(isinstance(bound, bool) for bound in episodes):
             raise TypeError
         first, stop = episodes
-        if isinstance(first, bool) or isinstance(stop, bool):
-            raise TypeError
         bounds = slice(first, stop)
         # Most histories have equally many episodes, so the Python loop is short.
         distinct, number = np.unique(counts, return_inverse=True)
