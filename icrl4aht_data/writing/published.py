@@ -302,7 +302,7 @@ class _PublishedHistory:
         return [f.name for f in fields if self.kind not in f.optional or self.line.get(f"has_{f.name}")]
 
     def check_arrays(self, present: set[str]) -> None:
-        """Check that `present`, the arrays in the history's group, has observations and all arrays to convert.
+        """Check that `present`, the names of the arrays in the group, has `obs` and all arrays to convert.
 
         Raises:
             PublishedFormatError: if arrays are missing; the message has the group and the names of the arrays.
