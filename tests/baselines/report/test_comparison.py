@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import gzip
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -26,21 +25,16 @@ LOW, HIGH = [0.0] * 5 + [10.0] * 95, [10.0] * 5 + [20.0] * 95
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory) -> Path:
-    """Write results on the layout track of two agents: `high`, which needs its memory, and `low`."""
+def stored(tmp_path_factory) -> StoredResults:
+    """Return results on the layout track of two agents: `high`, which needs its memory, and `low`."""
     folder = tmp_path_factory.mktemp("results")
     write_results(folder / "high", "high", HIGH, offset=1.0)
     write_results(folder / "high" / "cleared", "high (cleared)", [5.0] * 100, offset=0.5, forget=True)
     write_results(folder / "high" / "swapped", "high (swapped)", HIGH[:80] + [20.0] * 20, offset=1.0, swapped=True)
     write_results(folder / "low", "low", LOW)
-    return folder
-
-
-@pytest.fixture
-def stored(folders) -> StoredResults:
     found = StoredResults()
     for name in ("high", "low"):
-        found = comparison.add_submission(found, make_submission([folders / name], FACTS))
+        found = comparison.add_submission(found, make_submission([folder / name], FACTS))
     return found
 
 
