@@ -251,9 +251,7 @@ def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
     """Return name of a block -> mean return in the block, (...), from the returns of all episodes, (..., episodes)."""
     episodes = returns.shape[-1]
     return {
-        name: returns[..., start:stop].mean(axis=-1)
-        for name, (start, stop) in BLOCKS.items()
-        if episodes > (start if start >= 0 else -start)
+        name: returns[..., start:stop].mean(axis=-1) for name, (start, stop) in BLOCKS.items() if episodes > abs(start)
     }
 
 
