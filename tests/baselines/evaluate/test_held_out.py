@@ -44,7 +44,7 @@ def suite(tmp_path) -> Path:
 def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, tmp_path, monkeypatch):
     """The release with the training data is read over HTTP."""
     release, trained, results = tmp_path / "release", tmp_path / "run", tmp_path / "results"
-    random_release(release, layouts=("cramped_up",), teammates=1, streams=2, episodes=2)
+    random_release(release, layouts=("cramped_up",))
     monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 8, 5, heads=2, encoder="words"))
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     with http_server(release) as server:
