@@ -75,13 +75,13 @@ def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, 
     run_cli(f"report {results} --html {tmp_path / 'report.html'} --suite {suite}")
     table = pd.read_csv(results / "report" / "report.csv")
     assert table[["agent", "protocol", "layout", "family", "kind"]].drop_duplicates().to_numpy().tolist() == [
-        ["DPT+TA+next_obs+words", "seeded", "cramped_up", "rl", "held out"]
+        ["DPT+TA+next_obs", "seeded", "cramped_up", "rl", "held out"]
     ]
     text = (results / "report" / "report.md").read_text()
-    assert "## Held out tasks, seeded" in text and "| rl | DPT+TA+next_obs+words |" in text
+    assert "## Held out tasks, seeded" in text and "| rl | DPT+TA+next_obs |" in text
     page = (tmp_path / "report.html").read_text()
     assert "cramped_up, learned (held out)" in page
-    assert "<h4>DPT+TA+next_obs+words with rl/t0 (held out) on cramped_up</h4>" in page
+    assert "<h4>DPT+TA+next_obs with rl/t0 (held out) on cramped_up</h4>" in page
     assert page.count("data:image/gif") == 2
 
     other = shutil.copytree(trained, tmp_path / "other")
