@@ -45,7 +45,7 @@ def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, 
     """The release with the training data is read over HTTP."""
     release, trained, results = tmp_path / "release", tmp_path / "run", tmp_path / "results"
     random_release(release, layouts=("cramped_up",))
-    monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 8, 5, heads=2, encoder="words"))
+    monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 8, 5, heads=2, encoder="mlp"))
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     with http_server(release) as server:
         small = "--steps 1 --context 8 --batch-size 2 --validation-batches 1 --next-obs"
@@ -53,10 +53,10 @@ def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, 
         printed = run_cli(f"{train} --ta")
         with pytest.raises(OptionError, match=r"model\.teammate_actions: it has True, expected False"):
             run_cli(train)
-    assert "size tiny, the default on a CPU: layers 1, width 8, encoder words" in printed
+    assert "size tiny, the default on a CPU: layers 1, width 8, encoder mlp" in printed
     assert "K = 8, steps 1, batch size 2" in printed and "1 step in" in printed
     config = json.loads((trained / "config.json").read_text())
-    assert config["model"].items() >= {"layers": 1, "width": 8, "heads": 2, "encoder": "words"}.items()
+    assert config["model"].items() >= {"layers": 1, "width": 8, "heads": 2, "encoder": "mlp"}.items()
     assert (config["train"]["steps"], config["train"]["batch_size"]) == (1, 2)
     assert config["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
     assert (config["histories"]["data_version"], config["histories"]["root"]) == ("0.0.1", server.url)
@@ -75,13 +75,13 @@ def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, 
     run_cli(f"report {results} --html {tmp_path / 'report.html'} --suite {suite}")
     table = pd.read_csv(results / "report" / "report.csv")
     assert table[["agent", "protocol", "layout", "family", "kind"]].drop_duplicates().to_numpy().tolist() == [
-        ["DPT+TA+next_obs", "seeded", "cramped_up", "rl", "held out"]
+        ["DPT+TA+next_obs+mlp", "seeded", "cramped_up", "rl", "held out"]
     ]
     text = (results / "report" / "report.md").read_text()
-    assert "## Held out tasks, seeded" in text and "| rl | DPT+TA+next_obs |" in text
+    assert "## Held out tasks, seeded" in text and "| rl | DPT+TA+next_obs+mlp |" in text
     page = (tmp_path / "report.html").read_text()
     assert "cramped_up, learned (held out)" in page
-    assert "<h4>DPT+TA+next_obs with rl/t0 (held out) on cramped_up</h4>" in page
+    assert "<h4>DPT+TA+next_obs+mlp with rl/t0 (held out) on cramped_up</h4>" in page
     assert page.count("data:image/gif") == 2
 
     other = shutil.copytree(trained, tmp_path / "other")
