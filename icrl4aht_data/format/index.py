@@ -18,7 +18,14 @@ import msgspec
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import ALL_TRACKS, LABEL_VIEWS, SOURCES, SPLITS, check_family, check_membership
-from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, IndexFormatError, UnknownNameError, check_choice
+from icrl4aht_data.errors import (
+    EmptySelectionError,
+    Icrl4ahtError,
+    IndexFormatError,
+    OptionError,
+    UnknownNameError,
+    check_choice,
+)
 from icrl4aht_data.format.info import ReleaseInfo, read_info
 from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_layouts_stored, read_layouts
 from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, HISTORIES, INFO, KINDS, TEXTS, Entry, as_json, check_name
@@ -212,13 +219,16 @@ class Index:
         Raises:
             UnknownNameError: if a field or value does not exist in the benchmark; the message lists the valid names.
             EmptySelectionError: if no history of this release has these values; the message lists existing values.
+            OptionError: if a value is a mapping.
         """
         filters = {name: value for name, value in wanted.items() if value is not None}
         matching = np.ones(len(self.entries), bool)
         for given, value in filters.items():
             name = ALIASES.get(given, given)
             check_choice("filter", given, (*QUERY_FIELDS, LAYOUT_FAMILY, *ALIASES))
-            names = [value] if isinstance(value, str | Mapping) or not isinstance(value, Iterable) else value
+            if isinstance(value, Mapping):
+                raise OptionError(f"{given} = {value!r}: expected a name or a sequence of names")
+            names = [value] if isinstance(value, str) or not isinstance(value, Iterable) else value
             if name == LAYOUT_FAMILY:
                 name, names = "layout", self._family_layouts(names)
             matching &= self.entries.matches(name, {self._known_value(name, one, given) for one in names})
