@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from icrl4aht_baselines.control import control, worlds
+from icrl4aht_baselines.training import trainer
 from icrl4aht_generation.policy import Policy
 
 from tests.helpers.commands import run_cli
@@ -57,6 +58,7 @@ def test_control_command_exits_with_1_if_a_check_fails(tmp_path, monkeypatch, qu
 
 @pytest.mark.slow
 def test_tiny_control_trains_all_models_and_fails_checks(tmp_path, monkeypatch):
+    monkeypatch.setattr(trainer, "can_draw", lambda: False)
     monkeypatch.setattr(control.run_control, "__defaults__", (TINY, lambda name, total, step, loss: None))
     printed = run_cli("control", "--out", tmp_path, code=1)
     assert printed.count("FAIL") >= 2
