@@ -242,16 +242,14 @@ def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
     The value is 1 if the oracle earns more than `stay` with at least one of the layout's teammates, according to stored
     measurements, or if a teammate was not measured.
     """
-    matters: dict[str, bool] = {}
+    matters: dict[str, bool] = defaultdict(bool)
     for task in tasks:
         draw = find_measured(task.layout.name, task.teammate)
-        own = draw is None or draw.oracle - draw.stay >= LEAST_HEADROOM
-        matters[task.layout.name] = matters.get(task.layout.name, False) or own
+        matters[task.layout.name] |= draw is None or draw.oracle - draw.stay >= LEAST_HEADROOM
     if dataset is not None:
         for layout, task_id in zip(dataset.column("layout"), dataset.column("task_id"), strict=True):
             made = dataset.provenance.get(str(task_id))
-            own = made is None or made.references is None or made.references.egos_differ
-            matters[str(layout)] = matters.get(str(layout), False) or own
+            matters[str(layout)] |= made is None or made.references is None or made.references.egos_differ
     return {layout: 1.0 if found else FLAT_SHARE for layout, found in matters.items()}
 
 
