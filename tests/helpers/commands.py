@@ -23,9 +23,7 @@ def run_cli(*words: object, code: int = 0, program: Command = cli) -> str:
         program: click command to run, by default the program icrl4aht-data.
     """
     arguments = words[0].split() if len(words) == 1 and isinstance(words[0], str) else [str(word) for word in words]
-    result = CliRunner().invoke(program, arguments)
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
+    result = CliRunner().invoke(program, arguments, catch_exceptions=False)
     assert result.exit_code == code, result.output
     return result.output
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,6 +45,7 @@ from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import start_record
 from tests.helpers.commands import run_cli
+from tests.helpers.spoiled import read_lines
 
 LAYOUT = get_layout("cramped_up")
 MODEL = ModelOptions(width=16, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05)
@@ -129,7 +129,7 @@ def test_training_sequences_match_the_played_episode(trainer, episode):
 
 
 def test_training_log_has_losses_and_falling_imitation_weight(full_run):
-    lines = [json.loads(line) for line in (full_run[0] / "metrics.jsonl").read_text().splitlines()]
+    lines = read_lines(full_run[0] / "metrics.jsonl")
     assert [line["step"] for line in lines] == list(range(1, 7))
     assert [line["imitation_weight"] for line in lines] == pytest.approx(1 - np.arange(6) / 6)
     assert {"return cramped_up assembly_line", "policy_loss", "value_loss", "entropy", "loss"} <= lines[0].keys()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import shutil
 import signal
@@ -34,6 +33,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
+from tests.helpers.spoiled import read_lines
 from tests.helpers.tiny import start
 from tests.helpers.two_sources import two_source_release
 from tests.helpers.xla_flags import add_xla_flag
@@ -103,7 +103,7 @@ class TestResume:
 
     def test_training_writes_log_curves_and_settings(self, full_run):
         folder, state = full_run
-        lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        lines = read_lines(folder / "metrics.jsonl")
         assert [(line["step"], line["part"]) for line in lines] == [
             (2, "train"),
             (3, "held out"),
@@ -371,23 +371,25 @@ from pathlib import Path
 import jax
 import jax.experimental.multihost_utils
 root, out, *address = sys.argv[1:]
+out = Path(out)
 number = int(os.environ.get("PROCESS", 0))
 if address:
     jax.distributed.initialize(*address, num_processes=2, process_id=number)
     # Connect before compiling: a process that compiles for over 30 seconds makes the other fail to connect.
     jax.experimental.multihost_utils.sync_global_devices("start")
 from icrl4aht_baselines.training.stopping import TrainingStopped
-from tests.baselines.training.test_trainer import Checkpoints, small_job, steps_of
+from tests.baselines.training.test_trainer import Checkpoints, read_lines, small_job
 assert jax.device_count() == 2
 def stop(step, loss):
     if number == 1 and step == 1:
         os.kill(os.getpid(), 15)
 try:
-    small_job(root).train(Path(out), done=stop)
+    small_job(root).train(out, done=stop)
 except TrainingStopped as stopped:
-    print(stopped.code, Checkpoints(Path(out) / "checkpoints").steps, steps_of(out), flush=True)
+    steps = [line["step"] for line in read_lines(out / "metrics.jsonl")]
+    print(stopped.code, Checkpoints(out / "checkpoints").steps, steps, flush=True)
     jax.experimental.multihost_utils.sync_global_devices("stopped")
-    small_job(root).train(Path(out))
+    small_job(root).train(out)
 """
 
 
@@ -396,14 +398,6 @@ def small_job(root: Path) -> TrainingTask:
     options = TrainOptions(steps=3, batch_size=4, context=6, log_every=1, validation_batches=1, accumulate=2)
     model = ModelOptions(layers=1, width=8, heads=2)
     return prepare("ad", model, options, HistoryOptions(("demo_wide",), str(root)))
-
-
-def metrics(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-
-
-def steps_of(folder: str) -> list[int]:
-    return [line["step"] for line in metrics(Path(folder))]
 
 
 def test_processes_split_the_rows_of_a_batch(lite, monkeypatch):
@@ -423,7 +417,7 @@ def test_processes_split_the_rows_of_a_batch(lite, monkeypatch):
 def one_device_log(lite, tmp_path_factory) -> list[dict[str, Any]]:
     folder = tmp_path_factory.mktemp("one")
     small_job(lite[0]).train(folder)
-    return metrics(folder)
+    return read_lines(folder / "metrics.jsonl")
 
 
 def check_two_devices(
@@ -434,7 +428,7 @@ def check_two_devices(
     outputs = [process.communicate(timeout=240) for process in processes]
     for process, (_, error) in zip(processes, outputs, strict=True):
         assert process.returncode == 0, error
-    found = metrics(folder)
+    found = read_lines(folder / "metrics.jsonl")
     assert [(line["step"], line["part"]) for line in found] == [(line["step"], line["part"]) for line in log]
     for a, b in zip(found, log, strict=True):
         for name in a.keys() - {"part"}:
