@@ -16,10 +16,10 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 
-def flip_bit(path: Path, position: int = -1) -> None:
-    """Invert the lowest bit of one byte of a file."""
+def flip_bit(path: Path, position: int = -1, bit: int = 0) -> None:
+    """Invert one bit of a file."""
     data = bytearray(path.read_bytes())
-    data[position] ^= 1
+    data[position] ^= 1 << bit
     path.write_bytes(bytes(data))
 
 
