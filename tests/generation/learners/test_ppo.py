@@ -93,19 +93,16 @@ def frozen(untrained) -> LearnerState:
     rng = np.random.default_rng(0)
     params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.3, untrained.params)
     steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
-    return untrained._replace(params=params, optimizer=set_counters(untrained.optimizer, steps))
-
-
-def set_counters(optimizer: Any, steps: int) -> Any:
-    """Set the counters in an optimizer's state to a number of steps."""
-    return jax.tree.map(lambda x: jnp.full_like(x, steps) if jnp.issubdtype(x.dtype, jnp.integer) else x, optimizer)
+    optimizer = jax.tree.map(
+        lambda x: jnp.full_like(x, steps) if jnp.issubdtype(x.dtype, jnp.integer) else x, untrained.optimizer
+    )
+    return untrained._replace(params=params, optimizer=optimizer)
 
 
 class Played(NamedTuple):
     before: list[LearnerState]
     rollouts: list[Rollout]  # the leaves are NumPy arrays
     metrics: list[dict[str, float]]
-    after: LearnerState
 
 
 def play(update: UpdateFunction, state: LearnerState, updates: int) -> Played:
@@ -115,7 +112,7 @@ def play(update: UpdateFunction, state: LearnerState, updates: int) -> Played:
         state, rollout, values = update(state)
         rollouts.append(jax.tree.map(np.asarray, rollout))
         metrics.append({name: float(value) for name, value in values.items()})
-    return Played(before, rollouts, metrics, state)
+    return Played(before, rollouts, metrics)
 
 
 @pytest.fixture(scope="module")

@@ -271,21 +271,16 @@ def paths(points: list[SuiteCheckpoint]) -> list[str]:
     return [point.path for point in points]
 
 
-def test_first_policy_of_comedi_is_not_a_candidate(candidates):
-    """CoMeDi's first policy is trained only by self-play, like the members of FCP."""
-    found = paths(list(suite_checkpoints(candidates, LAYOUT.name, "comedi")))
-    assert found == [f"{LAYOUT.name}/comedi/m{m}/c{c}" for m in range(1, 10) for c in range(5)]
-    chosen = select_teammates(candidates, LAYOUT.name, "comedi", train=1000, heldout=0)
-    assert (chosen.candidates, chosen.good) == (45, 37)
-    assert not [path for path in paths(chosen.train) if "/m0/" in path]
-
-
 def test_only_checkpoints_with_returns_above_the_threshold_are_selected(candidates):
-    chosen = select_teammates(candidates, LAYOUT.name, "fcp", train=1000, heldout=0)
-    assert (chosen.candidates, chosen.good, len(chosen.train)) == (50, 40, 40)
-    everyone = chosen.train + chosen.heldout
-    assert len(set(paths(everyone))) == 40
-    assert all(point.card["teammate_return"] > 20 for point in everyone)
+    """CoMeDi's first policy is not a candidate, because it is trained only by self-play, like the members of FCP."""
+    for algorithm, first, counts in (("fcp", 0, (50, 40)), ("comedi", 1, (45, 37))):
+        found = paths(list(suite_checkpoints(candidates, LAYOUT.name, algorithm)))
+        assert found == [f"{LAYOUT.name}/{algorithm}/m{m}/c{c}" for m in range(first, 10) for c in range(5)]
+        chosen = select_teammates(candidates, LAYOUT.name, algorithm, train=1000, heldout=0)
+        assert (chosen.candidates, chosen.good) == counts
+        assert len({*paths(chosen.train)}) == len(chosen.train + chosen.heldout) == chosen.good
+        assert {*paths(chosen.train)} < {*found}
+        assert all(point.card["teammate_return"] > 20 for point in chosen.train)
 
 
 def test_selection_depends_on_seed_and_algorithm(candidates):
