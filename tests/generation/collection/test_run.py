@@ -48,7 +48,8 @@ def unfinished(profile, built, tmp_path) -> Path:
 def test_task_collected_by_another_process_is_waited_for(built, tmp_path):
     """A task that another process finishes in the meantime is not collected again."""
     profile = load_profile(str(built / "tiny.toml"))
-    job = CollectionJob(*profile.units(), profile, tmp_path)
+    (work,) = profile.units()
+    job = CollectionJob(work, profile, tmp_path)
     with run_lock(job.folder):
         assert run_job(job, wait=False) == "busy"
         shutil.copytree(artefact(built / "a"), job.folder)
