@@ -127,12 +127,7 @@ def learner(*improvements: int) -> np.ndarray:
         ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 4, [[1, 2], [1, 2]]),
         ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 3, [[1, 2], [1]]),  # improvement 30 exceeds 25
         ([learner(10, 20), learner(90, 80, 70, 60)], 3, [[1], [0, 1]]),
-        (
-            [learner(30, 20, 40, 50), learner(0, 5, 4, 0)],
-            4,
-            [[3, 2, 0], [1]],
-        ),  # only one stream of the second learner improves by 5
-        ([learner(30, 20, 40, 50), learner(0, 0)], 8, [[3, 2, 0, 1], []]),
+        ([learner(30, 20, 40, 50), learner(0, 5, 4, 0)], 8, [[3, 2, 0, 1], [1]]),
         ([learner(0), learner(0)], 2, [[], []]),
         ([learner(9), learner(7), learner(8)], 2, [[0], [], [0]]),
     ],

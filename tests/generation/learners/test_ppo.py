@@ -32,7 +32,6 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
-from tests.helpers.trees import same_bytes
 
 CLOSET = Layout("closet", "test_closet", ("WLWW01BW", "LA0WA  W", "WPWWPXWW"))
 EPISODE = 12
@@ -219,15 +218,6 @@ def test_ppo_loss_equals_formulas_in_numpy(learner, played):
     for name, loss in expected.items():
         np.testing.assert_allclose(parts[name], loss, rtol=1e-4, atol=1e-5, err_msg=name)
     np.testing.assert_allclose(total, policy + 0.5 * value_loss - 0.01 * entropy, rtol=1e-4, atol=1e-5)
-
-
-def test_ppo_update_depends_only_on_the_state(update, played):
-    state = played.before[3]
-    once, again = update(state), update(state)
-    assert same_bytes(once, again)
-    other_state, other_rollout, _ = update(state._replace(key=jax.random.key(77)))
-    assert not np.array_equal(other_rollout.actions[..., EGO], once[1].actions[..., EGO])
-    assert not same_bytes(other_state.carry.memories[EGO], once[0].carry.memories[EGO])
 
 
 def test_teammate_actions_depend_on_the_parameters_in_the_state(update, frozen, played):
