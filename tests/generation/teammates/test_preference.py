@@ -1,4 +1,4 @@
-"""Tasks of the track preference: stored manifests, disjoint splits, and layouts that hide the recipe."""
+"""Tasks of the track preference: disjoint splits, and layouts that hide the recipe."""
 
 from __future__ import annotations
 
@@ -10,19 +10,14 @@ from icrl4aht_generation.layouts.grids import canonical_map
 from icrl4aht_generation.teammates.instances import INSTANCES
 from icrl4aht_generation.teammates.preference import WATCHER, all_dishes, preference_tasks, training_dishes
 
-from icrl4aht_data.benchmark.facts import PREFERENCE, PREFERENCE_LAYOUTS
-from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks, teammate_id
+from icrl4aht_data.benchmark.facts import PREFERENCE_LAYOUTS
+from icrl4aht_data.benchmark.tasks import Task, teammate_id
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 
 
 @pytest.fixture(scope="module")
 def split_tasks() -> dict[str, list[Task]]:
     return {split: preference_tasks(split) for split in ("train", "validation", "test")}
-
-
-def test_manifests_contain_the_preference_tasks(split_tasks):
-    for split, tasks in split_tasks.items():
-        assert read_tasks(manifest_path(PREFERENCE, split)) == tasks
 
 
 def test_preference_splits_share_no_teammates_and_hold_out_layouts_and_recipes(split_tasks):
