@@ -17,6 +17,7 @@ from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.collection.scripted import scripted_bytes
 from icrl4aht_generation.collection.scripted_rollout import noise_schedules, play_scripted_histories
 from icrl4aht_generation.collection.task_folder import METADATA, TIMING, last_timing, partial_folder
+from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS
 from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.releases.check import compare_rebuilds
@@ -29,7 +30,8 @@ from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.errors import DiskFullError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.rules import step
-from tests.generation.teammates.test_learned import entry, save
+from icrl4aht_data.utils.files import file_hash
+from tests.generation.teammates.test_learned import save
 from tests.helpers.commands import run_cli
 from tests.helpers.tiny import NOISE
 
@@ -225,7 +227,8 @@ def test_noise_of_a_search_history_is_constant_until_its_last_episode():
 def test_scripted_histories_can_have_a_learned_teammate(profile, tmp_path):
     """The learned teammate takes the greedy actions of its policy."""
     save(tmp_path / "suite/member", LAYOUT)
-    mate = entry(tmp_path / "suite", "member")
+    theta = {"checkpoint": "member", "sha256": file_hash(tmp_path / "suite/member" / POLICY_WEIGHTS)}
+    mate = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0, "theta": theta}
     work = Work(make_task("teammate", "train", "demo_wide", mate, 3), "noise")
     job = CollectionJob(work, profile, tmp_path, tmp_path / "suite")
     job.run()
