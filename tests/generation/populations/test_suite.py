@@ -59,8 +59,8 @@ import numpy as np
 from tests.generation.populations import test_suite
 from flax.traverse_util import flatten_dict
 
-(population,) = test_suite.run_of("lbrdiv").stages
-state, _ = population.compiled_update(jax.jit(population.init)(jax.random.key(0)))
+(population,) = test_suite.run_of("fcp").stages
+state, _ = jax.jit(population.update)(jax.jit(population.init)(jax.random.fold_in(jax.random.key(0), 0)))
 assert jax.device_count() == 2
 used = {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(state.params)}
 assert used == {2}, used
@@ -228,8 +228,8 @@ def test_checkpoints_of_an_unfinished_population_raise_error(tmp_path):
 @pytest.mark.slow
 def test_population_on_two_devices_learns_the_same_policies(tmp_path):
     """After one update with half of the policies on each device, parameters agree up to rounding."""
-    (stage,) = run_of("lbrdiv").stages
-    state, _ = stage.compiled_update(jax.jit(stage.init)(jax.random.key(0)))
+    (stage,) = run_of("fcp").stages
+    state, _ = jax.jit(stage.update)(jax.jit(stage.init)(jax.random.fold_in(jax.random.key(0), 0)))
     flags = add_xla_flag("--xla_force_host_platform_device_count=2")
     process = start("-c", TWO_DEVICES, str(tmp_path / "weights.npz"), XLA_FLAGS=flags)
     _, errors = process.communicate(timeout=300)
