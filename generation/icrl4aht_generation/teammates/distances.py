@@ -71,7 +71,6 @@ _EPISODES = 10
 
 _SEED = 5
 
-
 _DIGITS = 4
 """Decimal places of stored numbers, which are exact for shares of 10,000 states and means of 20 returns."""
 
@@ -95,7 +94,7 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
     Raises:
         UnknownNameError: if the benchmark does not have the layout.
     """
-    records, tested = common_states(layout)
+    records, tested = common_states(layout, _EPISODES)
     actions = act_on_records(layout, policies, records)
     distances = distances_to_tests(tested, actions)
     nearest = distances.argmin(axis=1)
@@ -106,8 +105,12 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
 
 
 @lru_cache(maxsize=2)
-def common_states(layout: Layout) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
+def common_states(layout: Layout, episodes: int = _EPISODES) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
     """Return the states of a layout on which teammates are compared, and the actions of the test instances.
+
+    Args:
+        layout: layout of the states.
+        episodes: number of episodes of each test instance with each of the two egos.
 
     Returns:
         State records, see `common_records`, and the actions of the test instances, int8 (instances, T, N).
@@ -115,22 +118,17 @@ def common_states(layout: Layout) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
     Raises:
         UnknownNameError: if the benchmark does not have the layout.
     """
-    records = common_records(layout)
+    records = common_records(layout, episodes)
     return records, act_on_records(layout, instance_policies(layout), records)
 
 
 def instance_policies(layout: Layout) -> list[Policy]:
-    """Return the policies of all test instances of a layout, which see a `Situation`."""
-    return [build_teammate(None, entry) for entry in instance_entries(layout)]
-
-
-def instance_entries(layout: Layout) -> list[dict[str, Any]]:
-    """Return the test instances that test models trained on a layout, by family and number."""
+    """Return the test instances that test models trained on a layout, by family and number, which see a `Situation`."""
     tested = TESTED_ON.get(layout.name, layout.name)
-    return [entry for family in TESTED_FAMILIES for entry in published_teammates(tested, family)]
+    entries = [entry for family in TESTED_FAMILIES for entry in published_teammates(tested, family)]
+    return [build_teammate(None, entry) for entry in entries]
 
 
-@lru_cache(maxsize=2)
 def common_records(layout: Layout, episodes: int = _EPISODES) -> UInt8[Array, "T N S"]:
     """Return state records of episodes of the test instances, by family and instance.
 
@@ -297,14 +295,12 @@ def _measure(
     Args:
         layout: the training layout.
         entries: entries of heuristic teammates.
-        episodes: number of episodes with common states, see `common_records`.
+        episodes: number of episodes of the common states, see `common_states`.
     """
-    # Teammates and test instances act together, so each family needs only one compilation.
-    tested, records = instance_entries(layout), common_records(layout, episodes)
-    policies = [build_teammate(None, entry) for entry in with_equal_parameters([*tested, *entries])]
+    records, tested = common_states(layout, episodes)
+    policies = [build_teammate(None, entry) for entry in with_equal_parameters(entries)]
     actions = act_on_records(layout, policies, records)
-    tests, actions = actions[: len(tested)], actions[len(tested) :]
-    return actions, distances_to_tests(tests, actions), reference_returns(layout, policies[len(tested) :])
+    return actions, distances_to_tests(tested, actions), reference_returns(layout, policies)
 
 
 def _measured_fields(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[str, Any]:

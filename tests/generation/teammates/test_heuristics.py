@@ -88,17 +88,22 @@ def stacked(family: str, thetas: list[dict[str, Any]]) -> dict[str, np.ndarray]:
 
 
 @cache
+def start_records(name: str) -> np.ndarray:
+    """Return 128 records of random starts, and the published start."""
+    records = jax.jit(Environment(LAYOUTS[name]).init)(jax.random.split(jax.random.key(7), 128)).record
+    return np.concatenate([records, state_record(LAYOUTS[name], (1, 1, "up"), (5, 2, "up"))])
+
+
+@cache
 def played(name: str, family: str) -> tuple[np.ndarray, np.ndarray]:
     """Return actions (100, 5, 129) and returns (5, 129) of t0..t4 as agent 1, with published noise.
 
     The ego always stays. The last episode starts from the published state and has a constant recipe.
     """
-    layout, episodes = LAYOUTS[name], 128
+    layout, records = LAYOUTS[name], start_records(name)
     entries = published_teammates(name, family)
     policy = build_teammate(layout, entries[0], noise="fixed")
-    records = jax.jit(Environment(layout).init)(jax.random.split(jax.random.key(7), episodes)).record
-    pinned = state_record(layout, (1, 1, "up"), (5, 2, "up"))
-    recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, episodes + 1))
+    recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, len(records)))
     recipes[:, -1] = layout.recipe_items[0]
 
     def play_episode(params, record, recipes):
@@ -112,7 +117,7 @@ def played(name: str, family: str) -> tuple[np.ndarray, np.ndarray]:
 
     run = jax.jit(jax.vmap(jax.vmap(play_episode, (None, 0, 1), 1), (0, None, None), 1))
     params = stacked(family, [entry["theta"] for entry in entries])
-    actions, rewards = run(params, np.concatenate([records, pinned]), recipes)
+    actions, rewards = run(params, records, recipes)
     return np.asarray(actions), np.asarray(rewards.sum(axis=0))
 
 

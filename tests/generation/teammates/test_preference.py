@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 
 import pytest
-from icrl4aht_generation.layouts.families import find_generated, split_of
+from icrl4aht_generation.layouts.families import generate_layouts, split_of
 from icrl4aht_generation.layouts.grids import canonical_map
 from icrl4aht_generation.teammates.instances import INSTANCES
 from icrl4aht_generation.teammates.preference import WATCHER, all_dishes, preference_tasks, training_dishes
@@ -50,6 +50,7 @@ def test_preference_splits_share_no_teammates_and_hold_out_layouts_and_recipes(s
 
 def test_preference_layouts_hide_the_recipe_and_match_their_names():
     maps = Counter()
+    generated = {one.name: one for family in ("rooms", "templates") for one in generate_layouts(family, 0, 300)}
     for split, names in PREFERENCE_LAYOUTS.items():
         for name in names:
             layout = get_layout(name)
@@ -61,6 +62,6 @@ def test_preference_layouts_hide_the_recipe_and_match_their_names():
                 expected = tuple(row.replace("R", "W").replace("L", "W") for row in published.rows)
                 assert layout.rows == expected
             else:
-                assert layout.rows == find_generated(name).rows
+                assert layout.rows == generated[name].rows
                 assert (split_of(layout) == "train") == (split == "train")
     assert max(maps.values()) == 1

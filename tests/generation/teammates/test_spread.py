@@ -11,9 +11,8 @@ from icrl4aht_generation.teammates import spread as module
 from icrl4aht_generation.teammates.distances import (
     INSTANCE_NAMES,
     act_on_records,
-    common_records,
+    common_states,
     distances_to_tests,
-    instance_policies,
 )
 from icrl4aht_generation.teammates.draws import DIVERSE_DISTANCE, find_draw
 from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS, Heuristic, Sampling
@@ -135,9 +134,8 @@ def test_measured_spread_teammates_match_the_list():
     spread = read_spread(layout.name)
     family = "assembly_line"
     chosen = [mate for mate in spread.chosen if mate.family == family and RANDOM_ACTIONS not in mate.theta][:2]
-    records = common_records(layout, 4)
-    policies = [*instance_policies(layout), *(build_teammate(None, mate.entry) for mate in chosen)]
-    tested, actions = np.split(act_on_records(layout, policies, records), [len(INSTANCE_NAMES)])
+    records, tested = common_states(layout, 4)
+    actions = act_on_records(layout, [build_teammate(None, mate.entry) for mate in chosen], records)
     assert (actions[0] != actions[1]).mean() >= DIVERSE_DISTANCE
     for mate, distances in zip(chosen, distances_to_tests(tested, actions), strict=True):
         assert distances[INSTANCE_NAMES.index(mate.nearest)] == pytest.approx(mate.distance, abs=1e-4)
