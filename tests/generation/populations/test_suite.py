@@ -60,7 +60,9 @@ from tests.generation.populations import test_suite
 from flax.traverse_util import flatten_dict
 
 (population,) = test_suite.run_of("fcp").stages
-state, _ = jax.jit(population.update)(jax.jit(population.init)(jax.random.fold_in(jax.random.key(0), 0)))
+state = jax.jit(population.init)(jax.random.fold_in(jax.random.key(0), 0))
+update = jax.jit(population.update)
+state, _ = update(state)
 assert jax.device_count() == 2
 used = {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(state.params)}
 assert used == {2}, used
