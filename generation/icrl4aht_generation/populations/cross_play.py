@@ -52,30 +52,27 @@ def cross_play_returns(
     first, second = np.divmod(np.arange(a * b), b)
     if paired:
         first = second = np.arange(a)
-    play = _compiled_play(layout, network.widths, network.partners, tuple(first), tuple(second), episodes)
-    returns = np.asarray(play(egos, teammates, jax.random.key(seed), greedy), np.float64)
+    play = _compiled_play(layout, network.widths, network.partners, tuple(first), tuple(second), episodes, greedy)
+    returns = np.asarray(play(egos, teammates, jax.random.key(seed)), np.float64)
     return returns if paired else returns.reshape(a, b)
 
 
 @lru_cache(maxsize=32)
 def _compiled_play(
-    layout: Layout, widths: Widths, partners: int, first: tuple, second: tuple, episodes: int
-) -> Callable[[Any, Any, jax.Array, bool], jax.Array]:
-    """Return a compiled function that returns mean returns of pairs (first, second).
-
-    Its arguments are egos, teammates, a key, and whether the teammates act greedily.
-    """
+    layout: Layout, widths: Widths, partners: int, first: tuple, second: tuple, episodes: int, greedy: bool
+) -> Callable[[Any, Any, jax.Array], jax.Array]:
+    """Return a compiled function of egos, teammates and a key that returns mean returns of pairs (first, second)."""
     env, network = Environment(layout), ActorCritic(widths, partners)
     n = len(first) * episodes
     policies = [np.repeat(np.array(side), episodes) for side in (first, second)]
 
-    def player(params: Any, agent: int, greedy: bool | jax.Array) -> Player:
+    def player(params: Any, agent: int, greedy: bool) -> Player:
         numbers = range(max(policies[agent]) + 1)
         slots = np.stack([(policies[agent] == number).nonzero()[0] for number in numbers]) + agent * n
         return network_player(env, network, params, slots, jnp.zeros(slots.shape, jnp.int32), greedy)
 
     @jax.jit
-    def play(egos, teammates, key, greedy):
+    def play(egos, teammates, key):
         players = [player(egos, EGO, False), player(teammates, TEAMMATE, greedy)]
         carry = init_rollout(env, players, jax.random.split(jax.random.fold_in(key, 0), n))
         _, rollout = roll_out(env, players, carry, EPISODE_STEPS, jax.random.fold_in(key, 1))
