@@ -13,7 +13,6 @@ One JSON line for each part:
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import tempfile
 from collections.abc import Callable
@@ -24,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import click
-import h5py
 import jax
+import numpy as np
 from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.collection.task import make_learner
 from icrl4aht_generation.collection.task_folder import last_timing
@@ -39,20 +38,9 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, track_of
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks
 from icrl4aht_data.commands.options import COUNT
-from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.format.schema import HISTORIES, KINDS, TASKS
-from icrl4aht_data.writing.published import PUBLISHED_CHUNK
+from icrl4aht_data.format.schema import KINDS, TASKS
+from icrl4aht_data.writing.published import to_published
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-
-_PAPER_DTYPES = {
-    "obs": "float32",
-    "actions": "int32",
-    "rewards": "float32",
-    "dones": "bool",
-    "teammate_actions": "int32",
-    "expert_actions": "int32",
-}
-
 
 _NOISE = NoiseConfig(histories=64, episodes=100, finish=(0.5, 1.0))
 """Settings of the measured noise histories, which have 640,000 transitions."""
@@ -145,8 +133,8 @@ def transition_bytes(streams: int) -> dict[str, Any]:
     ]
     transitions = sum(history.entry.T for _, part in chosen for history in part)
     with tempfile.TemporaryDirectory() as folder:
-        write_paper_format(Path(folder) / "paper", [part for _, part in chosen])
-        found = {"paper": folder_size(Path(folder) / "paper") / transitions}
+        selected = dataset.select(np.concatenate([part.ids for _, part in chosen]))
+        found = {"paper": folder_size(to_published(selected, Path(folder) / "paper", states=False)) / transitions}
         for kind in KINDS:
             root = write_release(Path(folder) / kind, kind, new, data_version="0.0.0", card="")
             found[kind] = folder_size(root) / transitions
@@ -156,20 +144,6 @@ def transition_bytes(streams: int) -> dict[str, Any]:
         **{f"{name}_bytes_per_transition": round(size, 3) for name, size in found.items()},
         **{f"{kind}_smaller_by": round(found["paper"] / found[kind], 2) for kind in KINDS},
     }
-
-
-def write_paper_format(root: Path, parts: list[Dataset]) -> None:
-    """Write histories in the paper's format: one HDF5 file per layout, and the index."""
-    (root / "meta").mkdir(parents=True)
-    for part in parts:
-        with h5py.File(root / f"{part[0].entry.layout}.h5", "a") as file, (root / HISTORIES).open("a") as index:
-            for history in part:
-                group = file.require_group(str(history.entry.history_id))
-                for name, dtype in _PAPER_DTYPES.items():
-                    array = history.read(name).astype(dtype)
-                    chunk = (min(PUBLISHED_CHUNK, len(array)), *array.shape[1:])
-                    group.create_dataset(name, data=array, chunks=chunk, compression="gzip", compression_opts=6)
-                index.write(json.dumps(history.entry.to_json()) + "\n")
 
 
 PARTS_OF_COLLECTION = ("speed", "noise", "memory", "bytes")

@@ -27,7 +27,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache, partial
 from itertools import groupby, islice
@@ -67,11 +67,11 @@ _OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes and durations of all measurements.
+    """Sizes and durations of all measurements, by default those for a GPU.
 
     Attributes:
         product: number of rows and columns of the matrices in the large product.
-        ppo: environments, rollout length and minibatches of the learner.
+        ppo: hyper-parameters of the learner, except the encoder of its network.
         batch: B, batch size in training.
         length: upper limit of L in training and of K in acting.
         shrunk: name of a model size -> values that replace those of `SIZES`.
@@ -80,33 +80,24 @@ class Sizes:
         seconds: minimum duration of a measurement, after compilation.
     """
 
-    product: int
-    ppo: dict[str, int]
-    batch: int
-    length: int
-    shrunk: dict[str, dict[str, Any]]
-    episode_steps: int
-    tasks: int
-    seconds: float
+    product: int = 8192
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    batch: int = 1024
+    length: int = 500
+    shrunk: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    episode_steps: int = 100
+    tasks: int = 20
+    seconds: float = 4.0
 
     def mfu(self, flops: float, seconds: float, dtype: str) -> float:
         """Return the model FLOP utilisation: `flops / seconds` relative to the speed of the large product."""
         return round(flops / seconds / product_tflops(self.product, dtype, None, self.seconds / 4) / 1e12, 4)
 
 
-FULL_SIZES = Sizes(
-    product=8192,
-    ppo={"environments": 1024, "rollout": 256, "minibatches": 64},
-    batch=1024,
-    length=500,
-    shrunk={},
-    episode_steps=100,
-    tasks=20,
-    seconds=4.0,
-)
+FULL_SIZES = Sizes()
 SMALL_SIZES = Sizes(
     product=256,
-    ppo={"environments": 4, "rollout": 8, "minibatches": 2},
+    ppo=PPOConfig(environments=4, rollout=8, minibatches=2),
     batch=2,
     length=16,
     shrunk={"small": {"layers": 1, "width": 32}, "tiny": {"layers": 1, "width": 16}},
@@ -191,8 +182,7 @@ def measure_learner(sizes: Sizes, encoder: EncoderKind) -> dict[str, Any]:
 
     seconds = statistics.median(seconds_of_calls(update, sizes.seconds))
     return {
-        **sizes.ppo,
-        "epochs": config.epochs,
+        **{name: getattr(config, name) for name in ("environments", "rollout", "minibatches", "epochs")},
         "steps_per_second": round(config.steps_per_update / seconds, 1),
         "update_seconds": round(seconds, 4),
         "compile_seconds": round(program.compile_seconds, 1),
@@ -334,8 +324,7 @@ def h4_tasks() -> list[Task]:
 
 def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
     """Return the learner of an ego with teammate H4, with the paper's network but the given encoder."""
-    config = replace(PPOConfig(), widths=Widths(encoder=encoder), **sizes.ppo)
-    return heuristic_learner(get_layout(_LAYOUT), config)
+    return heuristic_learner(get_layout(_LAYOUT), replace(sizes.ppo, widths=Widths(encoder=encoder)))
 
 
 def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:

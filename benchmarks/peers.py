@@ -7,7 +7,7 @@ omegaconf, wandb) are replaced by stubs. The script also needs distrax, from the
 
 from __future__ import annotations
 
-import importlib.util
+import runpy
 import sys
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -29,11 +29,11 @@ with redirect_stdout(sys.stderr):  # JaxMARL prints when it is imported
     from jaxmarl.environments.overcooked_v2.overcooked import OvercookedV2
 
 
-def jaxmarl_environment(layout: Layout, max_steps: int = EPISODE_STEPS) -> OvercookedV2:
+def jaxmarl_environment(layout: Layout) -> OvercookedV2:
     """Return JaxMARL's OvercookedV2 environment on the map of a layout, with the benchmark's options."""
     return OvercookedV2(
         PeerLayout.from_string("\n".join(layout.rows), possible_recipes=[list(r) for r in layout.recipes]),
-        max_steps=max_steps,
+        max_steps=EPISODE_STEPS,
         agent_view_size=2,
         random_agent_positions=True,
         negative_rewards=True,
@@ -56,8 +56,8 @@ def jaxmarl_training(script: Path, env: MultiAgentEnv, config: PPOConfig, update
     Raises:
         click.UsageError: if `script` is not a Python file.
     """
-    module = _load_script(script)
-    module.jaxmarl.make = lambda name, **options: env
+    defined = _load_script(script)
+    defined["jaxmarl"].make = lambda name, **options: env
     options = {
         "ENV_NAME": "overcooked_v2",
         "ENV_KWARGS": {},
@@ -81,20 +81,17 @@ def jaxmarl_training(script: Path, env: MultiAgentEnv, config: PPOConfig, update
         "MAX_GRAD_NORM": config.max_grad_norm,
         "ACTIVATION": "relu",
     }
-    return compiled_call(module.make_train(options), jax.random.PRNGKey(0))
+    return compiled_call(defined["make_train"](options), jax.random.PRNGKey(0))
 
 
-def _load_script(path: Path) -> ModuleType:
-    """Import our copy of JaxMARL's training script as a module."""
+def _load_script(path: Path) -> dict[str, Any]:
+    """Run our copy of JaxMARL's training script, and return the names that the script defines."""
+    if path.suffix != ".py":
+        raise click.UsageError(f"{path}: not a Python file, expected a copy of JaxMARL's script")
     silent: Any = ModuleType("silent")
     silent.main = lambda **_: lambda function: function
     silent.log = lambda metric: None
     silent.OmegaConf = None
     for name in ("hydra", "omegaconf", "wandb"):
         sys.modules.setdefault(name, silent)
-    spec = importlib.util.spec_from_file_location("jaxmarl_ippo", path)
-    if spec is None or spec.loader is None:
-        raise click.UsageError(f"{path}: not a Python file, expected a copy of JaxMARL's script")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return runpy.run_path(str(path))

@@ -239,9 +239,8 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
                 text = without_credentials(" ".join(f"{type(cause).__name__}: {said}".split()))[:400]
                 if isinstance(cause, FileNotFoundError) or status == 404:
                     raise RemoteError(f"{address}: the remote has no such file: {text}", missing=True) from None
-                raise RemoteError(
-                    f"{address}: {text}; repeat the command, which does not download complete files again"
-                ) from None
+                remedy = "repeat the command, which does not download complete files again"
+                raise RemoteError(f"{address}: {text}; {remedy}") from None
         time.sleep(wait)
     raise AssertionError
 

@@ -190,10 +190,8 @@ class Dataset(Selection):
                 one history.
         """
         check_choice("split by", by, SPLIT_BY)
-        share, seed = (
-            check_number("validation", validation, Annotated[float, Meta(gt=0, lt=1)]),
-            check_int("seed", seed, 0),
-        )
+        share = check_number("validation", validation, Annotated[float, Meta(gt=0, lt=1)])
+        seed = check_int("seed", seed, 0)
         if by == "history":
             held = choose_histories(self, share, seed)
         else:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-import resource
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,12 +23,9 @@ from tests.helpers.commands import run_cli
 from tests.helpers.paths import ROOT
 from tests.helpers.published_files import KEPT, publish
 from tests.helpers.random_releases import random_release
-from tests.helpers.tiny import PAIR, TINY
+from tests.helpers.tiny import TINY
 from tests.helpers.two_sources import two_source_release
 from tests.helpers.xla_flags import add_xla_flag, is_xla_flag
-
-COMPILATIONS: list[float] = []
-"""Seconds that each JAX compilation in this process took."""
 
 MEMORY_TO_FREE = 1200 * 2**20
 """Memory in bytes above which a test worker clears JAX's compiled programs."""
@@ -64,17 +60,11 @@ def pytest_configure() -> None:
     os.environ.setdefault("JAX_PLATFORMS", "cpu")  # tests expect a CPU's bits and tolerances
     jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
     os.environ.setdefault("PJRT_NPROC", "1")  # must be set before JAX starts; test profiles use one thread
-    jax.monitoring.register_event_duration_secs_listener(_count_compilation)
     for name, value in COMPILATION_CACHE.items():
         jax.config.update(name, value)
         os.environ[name.upper()] = str(value)
     if "PYTEST_XDIST_WORKER" not in os.environ:
         _remove_unfinished_entries(Path(COMPILATION_CACHE["jax_compilation_cache_dir"]))
-
-
-def _count_compilation(event: str, duration_secs: float, **kwargs: Any) -> None:
-    if event == "/jax/core/compile/backend_compile_duration":
-        COMPILATIONS.append(duration_secs)
 
 
 def _remove_unfinished_entries(folder: Path) -> None:
@@ -90,22 +80,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the slowest test files first, so that all workers finish at about the same time."""
     order = {f"test_{name}.py": place for place, name in enumerate(COSTLIEST.split())}
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
-
-
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Report a worker's memory use and number of compilations to the main process."""
-    if hasattr(session.config, "workeroutput"):
-        peak, now = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024, psutil.Process().memory_info().rss >> 20
-        session.config.workeroutput["used"] = (  # type: ignore[attr-defined]
-            f"{peak} MB at most, {now} MB at the end; {len(COMPILATIONS)} compilations in {sum(COMPILATIONS):.0f} s"
-        )
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node) -> None:
-    """Print a worker's memory use and number of compilations."""
-    terminal = node.config.pluginmanager.get_plugin("terminalreporter")
-    terminal.write_line(f"\n{node.gateway.id}: {getattr(node, 'workeroutput', {}).get('used')}")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -178,26 +152,17 @@ def damaged(lite, tmp_path) -> Path:
     return root
 
 
-def _generate(profile: Path, out: Path, *options: str) -> None:
-    run_cli("generate", "--profile", profile, "--out", out, *options)
-
-
 @pytest.fixture(scope="session")
 def built(shared_folder) -> Path:
-    """A folder with tiny.toml, pair.toml, and `a`: the lite and full releases generated from tiny.toml. Read only."""
+    """A folder with tiny.toml, and `a`: the lite and full releases generated from tiny.toml. Read only."""
 
     def make(folder: Path) -> None:
         (folder / "tiny.toml").write_text(TINY)
-        (folder / "pair.toml").write_text(PAIR)
-        _generate(folder / "tiny.toml", folder / "a", "--kind", "lite", "--kind", "full")
+        run_cli(
+            "generate", "--profile", folder / "tiny.toml", "--out", folder / "a", "--kind", "lite", "--kind", "full"
+        )
 
     return shared_folder("built", make)
-
-
-@pytest.fixture(scope="session")
-def pair(built, shared_folder) -> Path:
-    """The release that the command `generate` makes from pair.toml. Read only."""
-    return shared_folder("pair", lambda folder: _generate(built / "pair.toml", folder))
 
 
 @pytest.fixture(scope="session")

@@ -129,7 +129,8 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
         job.train(run, done=show_steps(show, "Hybrid-AD", training.steps))
     print_text(f"losses on training and held-out histories: {run / RUN_CURVES}")
 
-    tasks = settings.tasks or demo_tasks()
+    every = bundled_tasks(PREFERENCE, "validation")  # new teammates, but the dishes of training
+    tasks = settings.tasks or [task for task in every if task.layout.name == DEMO_LAYOUT]
     print_stage(5, f"evaluating it and {', '.join(_AGENTS)} on {len(tasks)} validation tasks")
     agent = find_agent(run, greedy=False)
 
@@ -147,11 +148,6 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     print_text(f"return by episode: {picture}\nreport: {page}")
     print_text(f"done in {time.perf_counter() - started:.0f} s\n\n{conclusion(own, cleared)}")
     return page
-
-
-def demo_tasks() -> tuple[Task, ...]:
-    """Return the validation tasks of `DEMO_LAYOUT`, which have new teammates but the dishes of training."""
-    return tuple(task for task in bundled_tasks(PREFERENCE, "validation") if task.layout.name == DEMO_LAYOUT)
 
 
 def block_table(runs: Sequence[EvaluationRun]) -> pd.DataFrame:

@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
-from icrl4aht_generation.learners.resume import TIMING, last_line, run_lock
+from icrl4aht_generation.learners.resume import TIMING
 
 from icrl4aht_baselines.agents.egos import NamedEgo, find_agent
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
@@ -26,6 +26,7 @@ from icrl4aht_baselines.methods.options import SIZES, ModelOptions
 from icrl4aht_baselines.online.responses import with_headroom
 from icrl4aht_baselines.report.results import evaluate_agent
 from icrl4aht_baselines.training.histories import prepare
+from icrl4aht_baselines.training.job import TrainingJob
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, TrainOptions
 from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.benchmark.tasks import Task
@@ -91,6 +92,15 @@ class ProofOptions:
     tasks: dict[str, tuple[Task, ...]] | None = None
 
     @property
+    def steps_per_update(self) -> int:
+        """Number of history steps in a batch."""
+        return self.batch_size * self.context
+
+    def training(self, seed: int) -> TrainOptions:
+        """Return the settings of a training run, for the trainer."""
+        return TrainOptions(self.steps, self.batch_size, self.context, seed=seed, **_TRAINING)
+
+    @property
     def task_sets(self) -> dict[str, tuple[Task, ...]]:
         """Name of a set -> its tasks; by default the validation tasks of two tracks that have headroom."""
         if self.tasks is not None:
@@ -103,16 +113,13 @@ class ProofOptions:
 
 
 @dataclass(frozen=True)
-class ProofJob:
-    """Job that trains a model on histories and evaluates it, see `icrl4aht_generation.jobs.job.Job`.
+class ProofJob(TrainingJob):
+    """Job that trains a model on histories and evaluates it.
 
     Attributes:
         source: source of the histories, or "all".
         learner: a name in `LEARNERS`.
-        seed: seed of the training run.
-        options: settings that all jobs share.
-        out: folder of all jobs.
-        xla_threads: number of XLA threads on a CPU.
+        seed, options, out: see `TrainingJob`.
     """
 
     source: str
@@ -120,8 +127,6 @@ class ProofJob:
     seed: int
     options: ProofOptions
     out: Path
-    xla_threads: int | None = 1
-    is_quick: bool = False
 
     @property
     def name(self) -> str:
@@ -134,70 +139,27 @@ class ProofJob:
         return f"{LEARNERS[self.learner].title}, {self.source} histories, seed {self.seed}"
 
     @property
-    def folder(self) -> Path:
-        """Folder of the training run and of its results."""
-        return self.out / self.name
-
-    @property
-    def updates(self) -> int:
-        """Number of training steps."""
-        return self.options.steps
-
-    @property
-    def training(self) -> TrainOptions:
-        """Settings of this training run, for the trainer."""
-        own = self.options
-        return TrainOptions(own.steps, own.batch_size, own.context, seed=self.seed, **_TRAINING)
-
-    @property
-    def result_file(self) -> Path:
-        """Path of the file with the results of the finished job."""
-        return self.folder / "result.json"
-
-    def is_finished(self) -> bool:
-        """Return whether a result with the settings of this job is stored."""
-        return self.result_file.is_file() and self.result()["settings"] == self.settings
-
-    @property
     def settings(self) -> dict[str, Any]:
         """All settings that the result depends on, as JSON; the content of the release is not among them."""
         tasks = {name: [task.task_id for task in own] for name, own in self.options.task_sets.items()}
         return {"train": asdict(self.training), "root": self.options.root, "tasks": tasks}
-
-    def result(self) -> dict[str, Any]:
-        """Return the content of result.json: `settings`, `minutes` of training, and `returns` of `play_sets`."""
-        return parse_json(read_text(self.result_file))
-
-    def progress(self) -> tuple[int, float] | None:
-        """Return the finished training steps and the history steps per second; None before the first log line."""
-        timing = last_line(self.folder / "run" / TIMING)
-        if not timing:
-            return None
-        return timing["step"], timing["steps_per_second"] * self.options.batch_size * self.options.context
 
     def finished_text(self) -> str:
         """Return a note on the result for progress displays: mean returns on the track preference."""
         returns = self.result()["returns"]
         return f"first episode {returns[PREFERENCE]['1']:.1f}, episodes 6 to 20 {returns[PREFERENCE]['6-20']:.1f}"
 
-    def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
-        """Train the model, evaluate it with and without memory, and write the result."""
-        with run_lock(self.folder, wait=wait):
-            if self.is_finished():
-                return
-            learner, run = LEARNERS[self.learner], self.folder / "run"
-            source = () if self.source == "all" else (self.source,)
-            release, first = self.options.root, _FIRST_EPISODES.get(self.source, 0)
-            histories = HistoryOptions((ALL_LAYOUTS,), release, source=source, labels=learner.labels, first=first)
-            job = prepare(learner.method, _MODEL, self.training, histories)
-            job.train(run, done=lambda step, loss: on_update(step, (self.progress() or (0, 0.0))[1]))
-            content = {
-                "settings": self.settings,
-                "minutes": round(_training_seconds(run / TIMING) / 60, 1),
-                "returns": play_sets(find_agent(run, greedy=False), self.options, self.folder / "results"),
-            }
-            with atomic_write(self.result_file) as partial:
-                write_json(partial, content)
+    def measure(self, on_update: OnUpdate) -> dict[str, Any]:
+        """Train the model, and return the `minutes` of training and the `returns` of `play_sets`."""
+        learner, run = LEARNERS[self.learner], self.run_folder
+        source = () if self.source == "all" else (self.source,)
+        release, first = self.options.root, _FIRST_EPISODES.get(self.source, 0)
+        histories = HistoryOptions((ALL_LAYOUTS,), release, source=source, labels=learner.labels, first=first)
+        prepare(learner.method, _MODEL, self.training, histories).train(run, done=self.step_progress(on_update))
+        return {
+            "minutes": round(_training_seconds(run / TIMING) / 60, 1),
+            "returns": play_sets(find_agent(run, greedy=False), self.options, self.folder / "results"),
+        }
 
 
 def _training_seconds(timing: Path) -> float:

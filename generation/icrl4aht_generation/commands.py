@@ -140,8 +140,8 @@ def _profile_with_threads(name: str, threads: int | None) -> Profile:
     from icrl4aht_generation.profiles import load_profile
 
     def limit_threads(profile: Profile) -> None:
-        if threads or profile.xla_threads:
-            limit_xla_threads(threads or profile.xla_threads or 1)
+        if number := threads or profile.xla_threads:
+            limit_xla_threads(number)
 
     profile = load_profile(name, limit_threads)
     return replace(profile, xla_threads=threads) if threads else profile
@@ -289,10 +289,30 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
         console.print(f"{path}: {len(tasks)} tasks")
 
 
-@click.command(epilog=examples("icrl4aht-data research draws --layout demo_wide --out draws.jsonl"))
-@click.option(
-    "--layout", "layouts", type=LAYOUT, multiple=True, help="Training layout; repeat for more.", show_default="all"
+def _layouts_option(default_text: str) -> Callable[[Any], Any]:
+    return click.option(
+        "--layout", "layouts", type=LAYOUT, multiple=True, help="Layout; repeat for more.", show_default=default_text
+    )
+
+
+_algorithms_option = click.option(
+    "--algorithm",
+    "algorithms",
+    type=Names("algorithm", lambda: ALGORITHMS),
+    multiple=True,
+    default=ALGORITHMS,
+    help="fcp, brdiv, lbrdiv or comedi; repeat for more.",
+    show_default="all",
 )
+
+
+_suite_option = click.option(
+    "--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Folder of the populations."
+)
+
+
+@click.command(epilog=examples("icrl4aht-data research draws --layout demo_wide --out draws.jsonl"))
+@_layouts_option("all training layouts")
 @click.option(
     "--out",
     type=click.Path(dir_okay=False, path_type=Path),
@@ -328,30 +348,13 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
     console.print(f"wrote {path}")
 
 
-def _layouts_option(default_text: str) -> Callable[[Any], Any]:
-    return click.option(
-        "--layout", "layouts", type=LAYOUT, multiple=True, help="Layout; repeat for more.", show_default=default_text
-    )
-
-
-_algorithms_option = click.option(
-    "--algorithm",
-    "algorithms",
-    type=Names("algorithm", lambda: ALGORITHMS),
-    multiple=True,
-    default=ALGORITHMS,
-    help="fcp, brdiv, lbrdiv or comedi; repeat for more.",
-    show_default="all",
-)
-
-
 @click.command(
     cls=TopicCommand, epilog=examples("icrl4aht-data teammates --profile mini --layout cramped_up --algorithm fcp")
 )
 @_profile_option
 @_layouts_option("the profile's")
 @_algorithms_option
-@click.option("--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Write the populations here.")
+@_suite_option
 @click.option("--seed", type=SEED, default=0, help="Seed of the training.")
 @topic("Machines", _threads_option, queue_options)
 def teammates(
@@ -386,13 +389,7 @@ def teammates(
 @click.command()
 @_layouts_option("all that are finished")
 @_algorithms_option
-@click.option(
-    "--suite",
-    type=Folder(),
-    metavar="FOLDER",
-    default="build/suite",
-    help="Output folder of `teammates`.",
-)
+@_suite_option
 @click.option("--greedy", is_flag=True, help="Let the teammate act greedily, as in the dataset.")
 def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
     """Report how much the teammates of a suite differ.

@@ -16,19 +16,13 @@ from icrl4aht_data.utils.plugins import Plugins
 _TEAMMATE_LAYOUTS = ("coord_simple", "coord_ring", "test_simple", "test_wide", "demo_simple", "demo_wide")
 _LAYOUT_LAYOUTS = ("asymm_both", "cramped_up")
 
+SPLITS = ("train", "validation", "test", "heldout")
+"""Splits of the tasks. `validation` and `heldout` use training layouts. `validation`, for choosing models, has
+heuristic teammates in neither `train` nor `test`; `heldout` has learned teammates not in `train` (paper, App. F)."""
+
 TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
-    "teammate": {
-        "train": _TEAMMATE_LAYOUTS,
-        "validation": _TEAMMATE_LAYOUTS,
-        "test": _TEAMMATE_LAYOUTS,
-        "heldout": _TEAMMATE_LAYOUTS,
-    },
-    "layout": {
-        "train": _LAYOUT_LAYOUTS,
-        "validation": _LAYOUT_LAYOUTS,
-        "test": ("asymm_right", "cramped_down"),
-        "heldout": _LAYOUT_LAYOUTS,
-    },
+    "teammate": dict.fromkeys(SPLITS, _TEAMMATE_LAYOUTS),
+    "layout": dict.fromkeys(SPLITS, _LAYOUT_LAYOUTS) | {"test": ("asymm_right", "cramped_down")},
 }
 """Short layout names of each track and split: track -> split -> layouts (paper, App. A)."""
 
@@ -85,10 +79,6 @@ FOUR_RECIPES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
 """Recipes used for the published results on the layout track; the layouts themselves have the first and the last."""
 
 _OTHER_NUMBERS = 10_000  # how many values `layout_number` can take for registered layouts
-
-SPLITS = ("train", "validation", "test", "heldout")
-"""Splits of the tasks. `validation` and `heldout` use training layouts. `validation`, for choosing models, has
-heuristic teammates in neither `train` nor `test`; `heldout` has learned teammates not in `train` (paper, App. F)."""
 
 FAMILIES = ("rl", "H1", "H2", "H3", "H4")
 """Families of teammates: "rl" (learned policies) and the heuristics "H1".."H4" (paper, App. B)."""

@@ -20,7 +20,7 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import NotStoredError, OptionError, ReleaseError
 from icrl4aht_data.fetch import Remote
 from icrl4aht_data.format.layouts_file import layout_title
-from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, Entry, episode_returns
+from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, episode_returns
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.cells import WINDOW
 from icrl4aht_data.overcooked.drawing import AGENT_COLOURS
@@ -41,7 +41,6 @@ PAGE_MEGABYTES = 5
 """Default maximum size of a page, in MB."""
 
 _FILES = Path(__file__).parent
-
 
 NO_ACTION = 255
 """Placeholder action of an episode's last frame, which shows the state after the last step."""
@@ -104,9 +103,8 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
     ends = np.flatnonzero(dones) + 1
     _require(history, len(ends) == entry.episodes, f"{entry.episodes} episodes", f"{len(ends)} ends of episodes")
     starts, shown = np.concatenate([[0], ends[:-1]]), spread_episodes(len(ends), most)
-    steps = np.concatenate(
-        [np.arange(int(starts[e]), int(ends[e]) + 1) for e in shown]
-    )  # an episode has one frame more than steps: the state after its last step
+    # An episode has one frame more than steps: the state after its last step.
+    steps = np.concatenate([np.arange(int(starts[e]), int(ends[e]) + 1) for e in shown])
     last = np.cumsum(ends[shown] + 1 - starts[shown]) - 1
     steps[last] -= 1
 
@@ -116,7 +114,9 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
     _require(history, not wrong, "possible states", "; ".join(wrong))
     values = {"rewards": rewards[steps].astype(np.int8).view(np.uint8)}
     values["rewards"][last] = 0
-    for name in _embedded_actions(entry):
+    for name in (name for name in ACTION_FIELDS if entry.has(FIELDS[name])):
+        if name == "oracle_actions" and entry.source == "noise" and "expert_actions" in values:
+            continue  # the expert of a noise history is the oracle
         values[name] = history.read(name)[steps].astype(np.uint8)
         _require(history, int(values[name].max()) < len(ACTIONS), f"{name} below {len(ACTIONS)}", values[name].max())
         values[name][last] = NO_ACTION
@@ -139,13 +139,6 @@ def _require(history: History, fulfilled: bool, expected: str, found: object) ->
             f"{history.entry.shard}: history {history.entry.history_id}: expected {expected}, found {found}; "
             f"`icrl4aht-data verify --deep` lists all problems"
         )
-
-
-def _embedded_actions(entry: Entry) -> list[str]:
-    """Return the names of the action fields to show, without `oracle_actions` if they equal `expert_actions`."""
-    names = [name for name in ACTION_FIELDS if entry.has(FIELDS[name])]
-    twice = entry.source == "noise" and "expert_actions" in names
-    return [name for name in names if not (twice and name == "oracle_actions")]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.overcooked import layouts
+from icrl4aht_data.overcooked import cells
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.cells import COOKED, FACINGS, PLATE, STEP, WINDOW
 from icrl4aht_data.overcooked.layouts import Layout
@@ -143,10 +143,14 @@ def state_parts(layout: Layout) -> tuple[StatePart, ...]:
     """Return all parts of a layout's states in drawing order."""
     at, number = columns(layout), np.arange(record_size(layout))
     ego = int(number[at.positions][EGO])
-    parts = [
-        StatePart(f"cell {cell}", False, cell, *_fixture(layout, cell, at.recipe, at.delivered))
-        for cell in range(layout.cells)
-    ]
+    parts = []
+    for cell, kind in enumerate(layout.kinds.tolist()):
+        shown, draw = (), partial(_draw_constant, layout, cell)
+        if kind == cells.INDICATOR:
+            shown, draw = (at.recipe,), partial(_draw_indicator, layout)
+        elif kind == cells.GOAL:
+            shown, draw = (at.delivered,), _draw_goal
+        parts.append(StatePart(f"cell {cell}", False, cell, shown, draw))
     for cell, *pair in zip(layout.pots, number[at.pot_items].tolist(), number[at.pot_timers].tolist(), strict=True):
         parts.append(StatePart("pot", False, cell, tuple(pair), partial(_draw_pot, layout)))
     for cell, timer in zip(layout.buttons, number[at.buttons].tolist(), strict=True):
@@ -172,28 +176,19 @@ def item_contents(layout: Layout, item: int) -> list[int]:
     return [i for i in layout.ingredients for _ in range(item // layout.ingredient_item(i) & 3)]
 
 
-def _fixture(layout: Layout, cell: int, recipe: int, delivered: int) -> tuple[tuple[int, ...], Callable[..., None]]:
-    """Return the state record columns that a cell's drawing depends on, and the function that draws the cell."""
-    if layout.kinds[cell] == layouts.INDICATOR:
-        return (recipe,), partial(_draw_indicator, layout)
-    if layout.kinds[cell] == layouts.GOAL:
-        return (delivered,), _draw_goal
-    return (), partial(_draw_constant, layout, cell)
-
-
 def _draw_constant(layout: Layout, cell: int, canvas: Canvas, x: float, y: float) -> None:
     """Draw the constant part of a cell: floor, a wall or a pile, or the counter under a pot or a button."""
     kind, odd = layout.kinds[cell], (cell % layout.width + cell // layout.width) % 2
-    if kind == layouts.EMPTY:
+    if kind == cells.EMPTY:
         canvas.box(x, y, 1, 1, _FLOOR[1 - odd])
-    elif kind == layouts.WALL and cell not in layout.counters:
+    elif kind == cells.WALL and cell not in layout.counters:
         canvas.box(x, y, 1, 1, _FAR_WALL)
     else:
         _draw_counter(canvas, x, y)
-    if kind == layouts.PLATES:
+    if kind == cells.PLATES:
         for lift in (0.14, 0.07, 0, -0.07):
             _draw_item(layout, canvas, x, y + lift, PLATE, radius=0.32)
-    elif kind == layouts.PILE:
+    elif kind == cells.PILE:
         canvas.box(x, y, 0.86, 0.86, _CRATE, 0.06)
         canvas.box(x, y, 0.7, 0.7, _CRATE_INSIDE, 0.03)
         for dx, dy in ((-0.16, -0.16), (0.16, -0.16), (-0.16, 0.16), (0.16, 0.16)):

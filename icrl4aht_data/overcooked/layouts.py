@@ -13,17 +13,18 @@ from functools import cache, cached_property, lru_cache
 from operator import attrgetter
 from pathlib import Path
 from string import digits
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, get_type_hints
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
 from icrl4aht_data.errors import OptionError, unknown
-from icrl4aht_data.overcooked.actions import ACTIONS, EGO
+from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.cells import (
     BUTTON,
     EMPTY,
+    FACING_OF,
     FACINGS,
     GOAL,
     INDICATOR,
@@ -42,7 +43,7 @@ from icrl4aht_data.utils.options import convert_option
 from icrl4aht_data.utils.plugins import Plugins
 
 _LETTERS = {"W": WALL, "X": GOAL, "P": POT, "R": INDICATOR, "L": BUTTON, "B": PLATES, " ": EMPTY, "A": EMPTY}
-_TWO_RECIPES = ((0, 0, 0), (1, 1, 1))
+_type_hints = cache(get_type_hints)  # resolving them takes as long as all checks of a layout
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +66,11 @@ class Layout:
     name: str
     alias: str
     rows: tuple[str, ...]
-    recipes: tuple[tuple[int, int, int], ...] = _TWO_RECIPES
+    recipes: tuple[tuple[int, int, int], ...] = ((0, 0, 0), (1, 1, 1))
     indicates_delivery: bool = False
 
     def __post_init__(self) -> None:
-        for name, kind in _field_types().items():
+        for name, kind in _type_hints(Layout).items():
             object.__setattr__(self, name, convert_option(f"layout {self.name}: {name}", getattr(self, name), kind))
         if fault := self._map_fault() or self._recipe_fault():
             raise OptionError(f"layout {self.name}: {fault}")
@@ -186,18 +187,13 @@ class Layout:
     @cached_property
     def shows_recipe(self) -> bool:
         """Whether the ego can see a recipe indicator or a button from at least one cell that it can reach."""
-        shown = ((self.kinds == INDICATOR) | (self.kinds == BUTTON)).nonzero()[0]
-        own = self.rooms[EGO].astype(int)
-        (rows, columns), (own_rows, own_columns) = (divmod(cells, self.width) for cells in (shown, own))
-        away = np.maximum(abs(own_rows[:, None] - rows), abs(own_columns[:, None] - columns))
-        return bool((away <= WINDOW // 2).any())
+        seen = self.window[self.rooms[EGO]]
+        return bool(np.isin(self.kinds[seen[seen >= 0]], (INDICATOR, BUTTON)).any())
 
     @cached_property
     def walkable(self) -> np.ndarray:
         """bool (cells,): True for floor cells that at least one agent can reach."""
-        floor = np.zeros(self.cells, bool)
-        floor[np.concatenate(self.rooms)] = True
-        return floor
+        return np.isin(np.arange(self.cells), np.concatenate(self.rooms))
 
     @cached_property
     def ahead(self) -> np.ndarray:
@@ -208,13 +204,10 @@ class Layout:
     @cached_property
     def moves(self) -> np.ndarray:
         """uint8 (cells, 6): an agent's next cell by its cell and action, if the other agent does not block it."""
-        table = np.repeat(np.arange(self.cells, dtype=np.uint8)[:, None], len(ACTIONS), axis=1)
-        for action, name in enumerate(ACTIONS):
-            if name in FACINGS:
-                target = self.ahead[:, FACINGS.index(name)]
-                open_ = self.walkable & self.walkable[target]
-                table[open_, action] = target[open_]
-        return table
+        here = np.arange(self.cells, dtype=np.uint8)[:, None]
+        target = self.ahead[:, FACING_OF]
+        moved = np.where(self.walkable[:, None] & self.walkable[target], target, here)
+        return np.concatenate([moved, here, here], axis=1)  # the actions stay and interact do not move
 
     @cached_property
     def pots(self) -> tuple[int, ...]:
@@ -255,11 +248,6 @@ class Layout:
 
     def __repr__(self) -> str:
         return f"Layout({self.name!r}, {self.width}x{self.height}, C={self.channels})"
-
-
-@cache
-def _field_types() -> dict[str, Any]:
-    return get_type_hints(Layout)
 
 
 def tables_of(layout: Layout | Tables) -> Tables:

@@ -23,15 +23,7 @@ from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, channel_names
 from icrl4aht_data.overcooked.layouts import Layout, tables_of
 from icrl4aht_data.overcooked.rules import look_up
 from icrl4aht_data.overcooked.state import State, unpack
-from icrl4aht_data.overcooked.tables import (
-    AGENT_BITS,
-    DELIVERY_BIT,
-    FIXED_BIT,
-    RECIPE_BIT,
-    TIMER_BIT,
-    Array,
-    Tables,
-)
+from icrl4aht_data.overcooked.tables import AGENT_BITS, DELIVERY_BIT, FIXED_BIT, RECIPE_BIT, TIMER_BIT, Array, Tables
 
 
 def observe(layout: Layout | Tables, record: Array, agent: int, canonical: bool = False) -> Array:

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from PIL import Image
 
 _ENLARGE = 4
-_CELL_SIZES = 16, 128  # pixels: smaller cells lose details, with larger ones an episode takes more than 400 MB
 _GIF_COLOURS = 127  # a 128th palette entry is needed for transparent pixels, which do not change between frames
 
 
@@ -122,8 +121,8 @@ def _check_records(layout: Layout, records: np.ndarray, dimensions: int, cell: i
     _require(fits, f"{expected} for layout {layout.name}", f"{records.dtype} {records.shape}")
     wrong = faults(layout, records)
     _require(not wrong, f"possible states of layout {layout.name}", "; ".join(wrong))
-    least, most = _CELL_SIZES
-    _require(check_int("cell", cell, 0) in range(least, most + 1), f"cell from {least} to {most} pixels", cell)
+    # Smaller cells lose details, and with larger ones an episode takes more than 400 MB.
+    _require(16 <= check_int("cell", cell, 0) <= 128, "cell from 16 to 128 pixels", cell)
     return records
 
 

@@ -14,15 +14,7 @@ import numpy as np
 from icrl4aht_data.overcooked.actions import INTERACT
 from icrl4aht_data.overcooked.cells import BUTTON, COOKED, FACINGS, GOAL, PLATE, POT, WALL
 from icrl4aht_data.overcooked.layouts import Layout, tables_of
-from icrl4aht_data.overcooked.state import (
-    BUTTON_STEPS,
-    POT_STEPS,
-    Array,
-    State,
-    ingredient_count,
-    pack,
-    unpack,
-)
+from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, Array, State, ingredient_count, pack, unpack
 from icrl4aht_data.overcooked.tables import Tables
 
 DELIVERY_REWARD = 20.0
@@ -77,7 +69,6 @@ def step(layout: Layout | Tables, record: Array, actions: Array, next_recipe: Ar
     state = _move(tables, xp, state, actions)
     # The event USEFUL_PLATE depends on the number of plates in both agents' hands before agent 0 interacts.
     plates_in_hand = xp.sum(state.hands == PLATE, axis=-1, dtype=xp.uint8)
-    recipe = state.recipe
     events = []
     for agent in (0, 1):
         acting = actions[..., agent] == INTERACT
@@ -95,7 +86,7 @@ def step(layout: Layout | Tables, record: Array, actions: Array, next_recipe: Ar
         pot_timers=pot_timers,
         pot_items=pot_items,
         buttons=buttons,
-        recipe=xp.where(correct, next_recipe, recipe),
+        recipe=xp.where(correct, next_recipe, state.recipe),
         delivered=xp.astype(correct, xp.uint8),
     )
     return StepResult(pack(state), team_reward(happened), shaped_rewards(happened), happened)
@@ -108,14 +99,8 @@ def team_reward(events: Array) -> Array:
 
 def shaped_rewards(events: Array) -> Array:
     """Return the shaped reward of each agent, float32 (B, 2), for event bits uint8 (B, 2)."""
-    return _score(
-        events,
-        {
-            USEFUL_PLACEMENT: SHAPED_PLACEMENT,
-            USEFUL_DISH: SHAPED_DISH_PICKUP,
-            USEFUL_PLATE: SHAPED_PLATE_PICKUP,
-        },
-    )
+    values = {USEFUL_PLACEMENT: SHAPED_PLACEMENT, USEFUL_DISH: SHAPED_DISH_PICKUP, USEFUL_PLATE: SHAPED_PLATE_PICKUP}
+    return _score(events, values)
 
 
 def _score(events: Array, values: dict[int, float]) -> Array:

@@ -19,6 +19,7 @@ from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
 from icrl4aht_data.overcooked.cells import (
     BUTTON,
     CANONICAL_TYPES,
+    CENTRE,
     GOAL,
     INDICATOR,
     NOWHERE,
@@ -26,6 +27,7 @@ from icrl4aht_data.overcooked.cells import (
     PLATES,
     POT,
     WALL,
+    WINDOW,
 )
 
 if TYPE_CHECKING:
@@ -127,14 +129,8 @@ class Tables(NamedTuple):
 
 
 _PADDING = {
+    **dict.fromkeys(("pots", "buttons", "counters", "number", "goal_access", "distance", "target_distance"), NOWHERE),
     "kinds": WALL,
-    "pots": NOWHERE,
-    "buttons": NOWHERE,
-    "counters": NOWHERE,
-    "number": NOWHERE,
-    "goal_access": NOWHERE,
-    "distance": NOWHERE,
-    "target_distance": NOWHERE,
     "first_step": STAY,
     "ingredients": -1,
 }
@@ -200,15 +196,14 @@ def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = N
     for cells in (layout.pots, layout.counters, layout.buttons):
         number[list(cells)] = range(len(cells))
     row, column = np.divmod(np.arange(layout.cells, dtype=np.int32), layout.width)
-    beside = _neighbours(layout)
+    # The positions in the window of the cells above, below, left and right; -1 outside the map.
+    beside = layout.window[:, [CENTRE - WINDOW, CENTRE + WINDOW, CENTRE - 1, CENTRE + 1]]
     near = np.bitwise_or.reduce(np.where(beside >= 0, 1 << kinds.astype(int)[beside], 0), axis=1).astype(np.uint8)
     distance, first_step = _shortest_paths(layout)
     # A neighbour of -1 indexes the last cell, but `where` replaces this value.
     to_access = np.where((beside >= 0) & walkable[beside], distance[:, beside], NOWHERE).min(axis=-1)
     canonical = CANONICAL_TYPES if layout.ingredient_types <= CANONICAL_TYPES else 0
-    rooms = np.zeros((2, max(map(len, layout.rooms))), np.uint8)
-    for cells, room in zip(rooms, layout.rooms, strict=True):
-        cells[: len(room)] = room
+    sizes = [len(room) for room in layout.rooms]
     return Tables(
         kinds=kinds,
         piles=layout.piles,
@@ -224,8 +219,8 @@ def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = N
         pots=np.array(layout.pots, np.uint8),
         buttons=np.array(layout.buttons, np.uint8),
         counters=np.array(layout.counters, np.uint8),
-        rooms=rooms,
-        room_sizes=np.array([len(room) for room in layout.rooms], np.uint32),
+        rooms=np.stack([np.pad(room, (0, max(sizes) - len(room))) for room in layout.rooms]),
+        room_sizes=np.array(sizes, np.uint32),
         recipes=layout.recipe_items,
         recipe_count=np.array(len(layout.recipes), np.uint32),
         ingredients=np.array((*layout.ingredients, -1, -1, -1)[:3], np.int32),
@@ -238,14 +233,6 @@ def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = N
         target_distance=to_access,
         first_step=first_step,
     )
-
-
-def _neighbours(layout: Layout) -> np.ndarray:
-    """Return int (cells, 4): the cell above, below, left and right of each cell, -1 outside the map."""
-    row, column = np.divmod(np.arange(layout.cells)[:, None], layout.width)
-    x, y = column + np.array([0, 0, -1, 1]), row + np.array([-1, 1, 0, 0])
-    inside = (x >= 0) & (x < layout.width) & (y >= 0) & (y < layout.height)
-    return np.where(inside, y * layout.width + x, -1)
 
 
 def _stations(layout: Layout, column: np.ndarray, row: np.ndarray) -> np.ndarray:

@@ -175,18 +175,14 @@ class CellWords:
         return np.flatnonzero(shown)
 
 
-def cell_words(layouts: Sequence[Layout], canonical: bool = False) -> CellWords:
+@lru_cache(maxsize=16)
+def cell_words(layouts: tuple[Layout, ...], canonical: bool = False) -> CellWords:
     """Return the cached vocabulary of the visible cells on the given layouts.
 
     Args:
         layouts: one layout or several layouts; without `canonical`, all must have the same number of channels.
         canonical: whether words show the canonical channels, see `channels`, instead of the layouts' own.
     """
-    return _cached_words(tuple(layouts), canonical)
-
-
-@lru_cache(maxsize=16)
-def _cached_words(layouts: tuple[Layout, ...], canonical: bool) -> CellWords:
     return CellWords(layouts, canonical)
 
 
@@ -221,31 +217,26 @@ def _contents(layout: Layout, canonical: bool) -> dict[int, tuple[np.ndarray, np
     cooking = (recipes + (np.arange(1, POT_STEPS + 1)[:, None] << 8)).ravel()
     lit = (recipes + (np.arange(BUTTON_STEPS + 1)[:, None] << 8)).ravel()
     pairs = {_RECIPE: recipes, _GOAL: np.arange(2), _POT: np.append(potted, cooking), _BUTTON: lit, _COUNTER: carried}
+    size, channels = record_size(layout), fixed_channels(layout, canonical).start // 2  # channels of one agent
     found = {}
     for slot in _slots(layout):
-        if slot.kind not in found and (views := np.argwhere(layout.window_position[:, slot.cells] != NOWHERE)).size:
-            observer, cell = views[0][0], slot.cells[views[0][1]]
-            shown = _slot_view(layout, slot, pairs[slot.kind], observer, cell, canonical)
-            found[slot.kind] = pairs[slot.kind], shown
+        views = np.argwhere(layout.window_position[:, slot.cells] != NOWHERE)
+        if slot.kind in found or not views.size:
+            continue
+        observer, cell = views[0][0], slot.cells[views[0][1]]
+        record = np.zeros((len(pairs[slot.kind]), size), np.uint8)
+        record[:, 0], record[:, slot.byte] = observer, pairs[slot.kind] & 255
+        if slot.second is not None:
+            record[:, slot.second] = pairs[slot.kind] >> 8
+        shown = observe(layout, record, 0, canonical).reshape(len(record), VISIBLE, -1)
+        shown = shown[:, layout.window_position[observer, cell]]
+        shown[:, : 2 * channels] = 0
+        found[slot.kind] = pairs[slot.kind], shown
     bodies = (carried + (np.arange(len(FACINGS))[:, None] << 8)).ravel()
-    record = np.zeros((len(bodies), record_size(layout)), np.uint8)
+    record = np.zeros((len(bodies), size), np.uint8)
     where = columns(layout)
     record[:, 0] = np.flatnonzero(layout.walkable)[0]
     record[:, where.facings.start], record[:, where.hands.start] = bodies >> 8, bodies & 255
     own = observe(layout, record, 0, canonical).reshape(len(bodies), VISIBLE, -1)[:, CENTRE]
-    channels = fixed_channels(layout, canonical).start // 2  # number of channels of one agent
     own[:, channels:] = 0
     return found | {_SELF: (bodies, own), _OTHER: (bodies, np.roll(own, channels, axis=-1))}
-
-
-def _slot_view(layout: Layout, slot: _Slot, pairs: np.ndarray, observer: int, cell: int, canonical: bool) -> np.ndarray:
-    """Return the channels uint8 (n, C) of a slot's cell, seen from the cell `observer`."""
-    record = np.zeros((len(pairs), record_size(layout)), np.uint8)
-    record[:, slot.byte] = pairs & 255
-    if slot.second is not None:
-        record[:, slot.second] = pairs >> 8
-    record[:, 0] = observer
-    obs = observe(layout, record, 0, canonical).reshape(len(pairs), VISIBLE, -1)
-    obs = obs[:, layout.window_position[observer, cell]]
-    obs[:, : fixed_channels(layout, canonical).start] = 0
-    return obs

@@ -15,13 +15,7 @@ from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError, ReleaseError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
-from icrl4aht_data.format.schema import (
-    CARD_TABLES,
-    MANIFEST,
-    PARQUET_EPISODES,
-    PARQUET_INDEX,
-    RELEASE_CARD,
-)
+from icrl4aht_data.format.schema import CARD_TABLES, MANIFEST, PARQUET_EPISODES, PARQUET_INDEX, RELEASE_CARD
 from icrl4aht_data.plotting import plot_layouts, plot_learning_curves, save_figure
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
 from icrl4aht_data.utils.files import file_hash, files_below, write_json
@@ -32,8 +26,8 @@ from icrl4aht_data.writing.parquet import to_parquet, write_episodes
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder, check_target
 
 _COPIED_TEXTS = ("LICENSE", "CITATION.cff")
-_LIBRARIES = {"matplotlib": "plot", "PIL": "plot", "pyarrow": "hf", "mlcroissant": "hf"}
-"""Module required for building -> extra that installs it."""
+_LIBRARIES = ("matplotlib", "PIL", "pyarrow", "mlcroissant")
+"""Modules required for building, which the extras plot and hf install."""
 
 
 def build_release(

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 CROISSANT = "croissant.json"
 
 _STANDARD = "http://mlcommons.org/croissant/1.1"
-_RAI_STANDARD = "http://mlcommons.org/croissant/RAI/1.0"
-_LICENCE = "https://spdx.org/licenses/MIT.html"
 _FORMATS = {
     ".h5": "application/x-hdf5",
     ".json": "application/json",
@@ -80,7 +78,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         sets, records = zip(*_file_sets(context, root), strict=True)
         return mlc.Metadata(
             ctx=context,
-            conforms_to=[_STANDARD, _RAI_STANDARD],
+            conforms_to=[_STANDARD, "http://mlcommons.org/croissant/RAI/1.0"],
             name="icrl4aht_learning_histories",
             description=(
                 "Learning histories of ego agents that learn to cook in OvercookedV2 with one fixed teammate each, "
@@ -90,7 +88,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             ),
             version=info.data_version,
             date_published=datetime.datetime.combine(published, datetime.time.min),
-            license=[_LICENCE],
+            license=["https://spdx.org/licenses/MIT.html"],
             url=project_url(),
             cite_as=card_file("citation.bib").read_text(encoding="utf-8").strip(),
             creators=[mlc.Organization(ctx=context, name=AUTHORS)],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -19,10 +19,6 @@ from icrl4aht_data.utils.text import counted_noun
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
-
-_HUB_FILE = ".gitattributes"  # the Hub adds this file to every repository
-_NOTHING_SENT = "nothing was sent: run the same command again"
-_KEPT = "files sent so far are kept: run the same command to resume"
 
 
 @dataclass(frozen=True)
@@ -99,11 +95,11 @@ def upload_release(
     api, repo, version = HfApi(), found[1], read_info(folder).data_version
     sizes = {name: (folder / name).stat().st_size for name in sorted([*read_manifest(folder), MANIFEST])}
     plan = Upload(repo, f"v{version}", f"{api.endpoint}/datasets/{repo}", sizes)
-    with _wrap_hub_errors(plan, api, _NOTHING_SENT):
+    with _wrap_hub_errors(plan, api, "nothing was sent: run the same command again"):
         plan = _complete_plan(api, plan, folder, private)
     if dry_run or plan.done == "already there":
         return plan
-    with _wrap_hub_errors(plan, api, _KEPT):
+    with _wrap_hub_errors(plan, api, "files sent so far are kept: run the same command to resume"):
         return _upload_and_tag(api, plan, folder)
 
 
@@ -127,9 +123,8 @@ def _complete_plan(api: HfApi, plan: Upload, folder: Path, private: bool) -> Upl
         raise UploadError(f"{plan.repo} is a public repository; make it private in its settings, or give another one")
     present = _repository_files(api, plan.repo, "main")
     foreign = sorted(present - plan.files.keys())
-    listed: Mapping[str, str] = {}
-    if foreign and MANIFEST in present:
-        listed = read_manifest(_get_manifest(api, plan.repo, "main").parent)
+    has_release = foreign and MANIFEST in present
+    listed = read_manifest(_get_manifest(api, plan.repo, "main").parent) if has_release else {}
     if unknown := [name for name in foreign if name not in listed]:
         raise UploadError(
             f"{plan.repo}: contains {counted_noun(len(unknown), 'file')} outside any release, such as {unknown[0]}: "
@@ -167,8 +162,8 @@ def _differences(api: HfApi, plan: Upload, revision: str, folder: Path) -> list[
 
 
 def _repository_files(api: HfApi, repo: str, revision: str) -> set[str]:
-    """Return the paths of the repository's files, without files that the Hub adds."""
-    return {name for name in api.list_repo_files(repo, revision=revision, repo_type="dataset") if name != _HUB_FILE}
+    """Return the paths of the repository's files, without `.gitattributes`, which the Hub adds."""
+    return {*api.list_repo_files(repo, revision=revision, repo_type="dataset")} - {".gitattributes"}
 
 
 def _get_manifest(api: HfApi, repo: str, revision: str) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, Unpack, cast
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Unpack, cast
 
 import numpy as np
 
@@ -11,14 +11,7 @@ from icrl4aht_data.benchmark.facts import all_families
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.reading.sources import ReadRequest
-from icrl4aht_data.sampling.base import (
-    Sampler,
-    SamplerOptions,
-    batch_repr,
-    check_labels,
-    describe_batch,
-    warn_of_weak_labels,
-)
+from icrl4aht_data.sampling.base import A, Sampler, SamplerOptions, batch_repr, check_labels, describe_batch
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.options import check_int
@@ -26,9 +19,6 @@ from icrl4aht_data.utils.options import check_int
 if TYPE_CHECKING:
     import jax  # noqa: F401 - used by a type argument of the base class
     import torch  # noqa: F401
-
-A = TypeVar("A")
-"""Type of the arrays of a batch: NumPy arrays, JAX arrays on a device, or PyTorch tensors."""
 
 
 class ADBatch(NamedTuple, Generic[A]):
@@ -69,24 +59,6 @@ class ADBatch(NamedTuple, Generic[A]):
 
     describe = describe_batch
     __repr__ = batch_repr
-
-
-class _Windows(NamedTuple):
-    """The randomly drawn windows of a batch.
-
-    Attributes:
-        position: int64 (B,), position of each window's history in the selection.
-        starts: int64 (B,), first step of each window.
-        rows: the rows to read as in `ReadRequest`: first steps, int64 (B,), or all steps, int64 (B, L).
-        previous: the step before each element of `rows`; -1 before the first step of a history.
-        valid: int64 (B,), number of steps of each window before padding.
-    """
-
-    position: np.ndarray
-    starts: np.ndarray
-    rows: np.ndarray
-    previous: np.ndarray
-    valid: np.ndarray
 
 
 class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torch.Tensor]"]):
@@ -147,7 +119,6 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         self.families, self.labels = families, labels
         if labels is not None:
             check_labels(dataset, labels)
-            warn_of_weak_labels(dataset, labels)
 
     def options(self) -> dict[str, Any]:
         # Options with default values are left out, so a position stored before an option existed can be resumed.
@@ -178,10 +149,19 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
 
     def windows(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the history ids and the first steps of the windows of batch i, int64 (B,) each."""
-        drawn = self._draw(i)
-        return self.dataset.ids[drawn.position].astype(np.int64), drawn.starts
+        position, starts, *_ = self._draw(i)
+        return self.dataset.ids[position].astype(np.int64), starts
 
-    def _draw(self, i: int) -> _Windows:
+    def _draw(self, i: int) -> tuple[np.ndarray, ...]:
+        """Draw the windows of batch i.
+
+        Returns:
+            int64 (B,), position of each window's history in the selection.
+            int64 (B,), first step of each window.
+            The rows to read as in `ReadRequest`: first steps, int64 (B,), or all steps, int64 (B, L).
+            The step before each of these rows; -1 before the first step of a history.
+            int64 (B,), number of steps of each window before padding.
+        """
         for_history, for_start, for_episode = self._random(i, 3)
         low, high = self._draws.steps(i)
         position = weighted_choice(for_history, self._draws.history_weights(low, high), 0, len(low))
@@ -197,14 +177,14 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         valid = np.minimum(total - start, self.length)
         if self.every == 1:
             # A window given by its first row is copied as a block, ten times faster than L single rows.
-            return _Windows(position, low + start, low + start, low + start - 1, valid)
+            return position, low + start, low + start, low + start - 1, valid
         # Step t of a window is step t % steps of episode first + n * (t // steps) of the range. The row of step
         # -1 comes first, for `prev_*`. Padding repeats the last step, since all rows must exist.
         t = np.minimum(start[:, None] + np.arange(-1, self.length), total[:, None] - 1)
         rows = low[:, None] + (first[:, None] + self.every * (t // steps)) * steps + t % steps
         # At a window's first step, `prev_*` come from the preceding step of the history, also across episodes.
         rows[start == 0, 0] = (low + first * steps - 1)[start == 0]
-        return _Windows(position, rows[:, 1], rows[:, 1:], rows[:, :-1], valid)
+        return position, rows[:, 1], rows[:, 1:], rows[:, :-1], valid
 
     def batch(self, i: int, out: ADBatch[np.ndarray] | None = None) -> ADBatch[np.ndarray]:
         batch = self._buffer(out)  # before drawing, so that a batch that is too large is refused at once

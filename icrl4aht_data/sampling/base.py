@@ -22,6 +22,9 @@ from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.system import new_array
 from icrl4aht_data.utils.text import counted_histories, counted_noun, listed_names
 
+A = TypeVar("A")
+"""Type of the arrays of a batch: NumPy arrays, JAX arrays on a device, or PyTorch tensors."""
+
 B = TypeVar("B", bound=tuple)
 """A batch: a named tuple of NumPy arrays, some of which may be None. Targets are int64, which PyTorch's losses need."""
 
@@ -208,11 +211,8 @@ def warn_of_mixed_splits(dataset: Selection) -> None:
         )
 
 
-def check_labels(dataset: Selection, labels: Labels) -> Labels:
-    """Check that all histories of a selection have labels of the given kind.
-
-    Returns:
-        The argument `labels`.
+def check_labels(dataset: Selection, labels: Labels) -> None:
+    """Check that all histories of a selection have labels of the given kind, and warn of weak labels.
 
     Raises:
         UnknownNameError: if `labels` is not a kind of labels.
@@ -221,7 +221,8 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
     check_choice("labels", labels, LABELS)
     has = {name: dataset.has_labels(name) for name in LABELS}
     if has[labels].all():
-        return labels
+        _warn_of_weak_labels(dataset, labels)
+        return
     missing = np.flatnonzero(~has[labels])
     counts = ", ".join(f"{int(has[name].sum())} have {name} actions" for name in LABELS)
     tasks = dataset.column("task_id")[missing]
@@ -232,7 +233,7 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
     )
 
 
-def warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
+def _warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
     """Warn of tasks whose labels come from a policy that earns less than half of the histories' final return.
 
     The final return is the mean of `return_end` over a task's selected histories; see `schema.are_labels_weak`.
@@ -258,7 +259,7 @@ def warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
         f"the {labels} actions of {len(weak)} of {len(codes)} tasks come from {player} less than half of what their "
         f"histories earn at the end: {named}. A model would learn to play worse than its contexts: {advice}",
         WeakLabelsWarning,
-        stacklevel=4,  # the line that called Dataset.ad or Dataset.dpt
+        stacklevel=5,  # the line that called Dataset.ad or Dataset.dpt
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, Unpack
 
 import numpy as np
 
@@ -11,14 +11,7 @@ from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.reading.sources import ReadRequest
-from icrl4aht_data.sampling.base import (
-    Sampler,
-    SamplerOptions,
-    batch_repr,
-    check_labels,
-    describe_batch,
-    warn_of_weak_labels,
-)
+from icrl4aht_data.sampling.base import A, Sampler, SamplerOptions, batch_repr, check_labels, describe_batch
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.options import check_int
@@ -26,9 +19,6 @@ from icrl4aht_data.utils.options import check_int
 if TYPE_CHECKING:
     import jax  # noqa: F401 - used by a type argument of the base class
     import torch  # noqa: F401
-
-A = TypeVar("A")
-"""Type of the arrays of a batch: NumPy arrays, JAX arrays on a device, or PyTorch tensors."""
 
 ContextOrder = Literal["contiguous", "random"]
 CONTEXT_ORDERS: tuple[ContextOrder, ...] = ("contiguous", "random")
@@ -66,22 +56,6 @@ class DPTBatch(NamedTuple, Generic[A]):
 
     describe = describe_batch
     __repr__ = batch_repr
-
-
-class _Contexts(NamedTuple):
-    """The randomly drawn queries and contexts of a batch.
-
-    Attributes:
-        query: int64 (B,), position of each query's history in the selection.
-        query_steps: int64 (B, Q), steps of the queries.
-        context: int64 (B,), position of each context's history in the selection.
-        steps: int64 (B, K), the steps of the contexts' transitions.
-    """
-
-    query: np.ndarray
-    query_steps: np.ndarray
-    context: np.ndarray
-    steps: np.ndarray
 
 
 class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[torch.Tensor]"]):
@@ -135,14 +109,13 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         self.queries = check_int("queries", queries, 1)
         super().__init__(dataset, batch_size=batch_size, length=context, **options)
         check_choice("order", order, CONTEXT_ORDERS)
-        self.labels = check_labels(dataset, labels)
         # The shortest part of a curriculum is its first or its last part; batch 2**62 has the last part.
         ranges = (map(self._count_transitions, self._draws.steps(i)) for i in (0, 2**62))
         shortest = min(int((high - low).min()) for low, high in ranges)
         if (self.length if order == "contiguous" else 1) > shortest:
             raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; give fewer")
-        self.order: ContextOrder = order
-        warn_of_weak_labels(dataset, labels)
+        check_labels(dataset, labels)
+        self.order, self.labels = order, labels
 
     def options(self) -> dict[str, Any]:
         excluded = {} if self.dataset.has_states else {"excluded": "last steps of episodes"}
@@ -205,7 +178,15 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
             batch.layouts[...] = self.dataset.layout_numbers[query]
         return batch
 
-    def _draw(self, i: int) -> _Contexts:
+    def _draw(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Draw the queries and contexts of batch i.
+
+        Returns:
+            int64 (B,), position of each query's history in the selection.
+            int64 (B, Q), steps of the queries.
+            int64 (B,), position of each context's history in the selection.
+            int64 (B, K), the steps of the contexts' transitions.
+        """
         drawn = self.length if self.order == "random" else 1
         random = self._random(i, 3 + self.queries + drawn)
         for_task, for_query, for_context = random[:3]
@@ -226,16 +207,15 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         window = self.length // drawn
         low, high = self._count_transitions(low)[context][:, None], self._count_transitions(high)[context][:, None]
         transitions = low + scale_to_range(for_steps, high - low - window + 1) + np.arange(window)
-        return _Contexts(query, query_steps, context, self._transition_steps(transitions))
+        return query, query_steps, context, self._transition_steps(transitions)
 
     @cached_property
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions in the selection sorted by task, int64 (H,), and where each task starts and ends in this order."""
         _, first, task = np.unique(self.dataset.column_codes("task_id"), return_index=True, return_inverse=True)
-        rank = np.empty(len(first), np.int64)
-        rank[np.argsort(first)] = np.arange(len(first))
-        sizes = np.bincount(rank[task])
-        return np.argsort(rank[task], kind="stable"), np.cumsum(sizes) - sizes, np.cumsum(sizes)
+        task = np.argsort(np.argsort(first))[task]  # renumbered by first appearance
+        sizes = np.bincount(task)
+        return np.argsort(task, kind="stable"), np.cumsum(sizes) - sizes, np.cumsum(sizes)
 
     # Transitions are the steps whose next observation is stored: all steps in a release with states, otherwise all but
     # the last one of each episode. A draw is the number of a transition.

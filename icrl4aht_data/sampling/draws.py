@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -47,13 +48,11 @@ class Curriculum:
     def __post_init__(self) -> None:
         check_int("curriculum batches", self.batches, 1)
         for name, part in (("first", self.first), ("last", self.last)):
-            try:
+            with suppress(TypeError, ValueError):
                 low, high = part
-                valid = 0 <= low < high <= 1
-            except (TypeError, ValueError):
-                valid = False
-            if not valid:
-                raise OptionError(f"curriculum {name} = {part!r}: expected fractions 0 <= low < high <= 1")
+                if 0 <= low < high <= 1:
+                    continue
+            raise OptionError(f"curriculum {name} = {part!r}: expected fractions 0 <= low < high <= 1")
 
     def part(self, i: int) -> tuple[float, float]:
         """Return the low and the high fraction of the part at batch i."""
@@ -202,11 +201,9 @@ def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[n
     if episodes is None:
         return np.zeros_like(counts), counts
     try:
-        if not isinstance(episodes, tuple):
+        if not isinstance(episodes, tuple) or any(isinstance(bound, bool) for bound in episodes):
             raise TypeError
         first, stop = episodes
-        if isinstance(first, bool) or isinstance(stop, bool):
-            raise TypeError
         bounds = slice(first, stop)
         # Most histories have equally many episodes, so the Python loop is short.
         distinct, number = np.unique(counts, return_inverse=True)

@@ -10,12 +10,10 @@ import numpy as np
 from icrl4aht_data.format.schema import record_field
 from icrl4aht_data.overcooked.channels import canonical_positions
 from icrl4aht_data.overcooked.fast_observe import fast_observe
-from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.selection import Selection
-from icrl4aht_data.utils.system import run_in_slices
 
-_STEPS = 8192  # steps rendered at a time if there are several layouts, which keeps temporary copies small
+_STEPS = 8192  # steps per thread rendered at a time if there are several layouts, which keeps temporary copies small
 
 
 class ArraySpec(NamedTuple):
@@ -81,24 +79,16 @@ class Observer:
         if len(self._layouts) == 1 and self._selection.has_states:
             fast_observe(self._layouts[0], records, out, threads, self._canonical)
             return
-        slab = max(1, _STEPS // math.prod(out.shape[1:-3]))
+        slab = max(1, threads * _STEPS // math.prod(out.shape[1:-3]))
         # Layouts differ in their channels, so the rows of each layout are rendered separately and then copied.
         numbers = self._selection.layout_numbers[histories]
         for number in np.unique(numbers).tolist():
             layout, rows = self._layouts[number], np.flatnonzero(numbers == number)
-
-            # Defaults bind the loop's variables, which threads would otherwise see change.
-            def render(start: int, stop: int, layout=layout, rows=rows) -> None:
-                for first in range(start, stop, slab):
-                    part = rows[first : min(first + slab, stop)]
-                    shown = np.zeros((len(part), *out.shape[1:]), out.dtype)
-                    out[part] = self._render_layout(layout, records[part], shown)
-
-            run_in_slices(render, len(rows), threads, least=slab)
-
-    def _render_layout(self, layout: Layout, records: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """Render records of one layout into `out`, which must contain zeros, and return `out`."""
-        if self._selection.has_states:
-            return fast_observe(layout, records[..., : record_size(layout)], out, canonical=self._canonical)
-        out[..., canonical_positions(layout)] = records[..., : layout.channels]
-        return out
+            for first in range(0, len(rows), slab):
+                part = rows[first : first + slab]
+                shown, own = np.zeros((len(part), *out.shape[1:]), out.dtype), records[part]
+                if self._selection.has_states:
+                    fast_observe(layout, own[..., : record_size(layout)], shown, threads, self._canonical)
+                else:
+                    shown[..., canonical_positions(layout)] = own[..., : layout.channels]
+                out[part] = shown

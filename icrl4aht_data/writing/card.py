@@ -8,7 +8,6 @@ import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +69,6 @@ _MIXED, _WATCHING = "heuristic mixed with random actions", "heuristic that never
 _SCHEDULE = {"histories", "episodes", "start", "end", "begin", "finish", "power"}
 
 
-@cache
 def card_texts(section: str) -> dict[str, str]:
     """Return the texts of a section of `cards/dataset_texts.toml` by name.
 
@@ -137,10 +135,6 @@ class _TaskFacts:
     histories: Sequence[Entry]
     task: Task | None
     made: Provenance
-
-    @property
-    def name(self) -> str:
-        return teammate_name(self.task) if self.task else self.first.teammate_kind
 
     @property
     def has_weak_labels(self) -> bool:
@@ -251,14 +245,14 @@ def _learning_rows(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> li
     for key, own in groups.items():
         entries = [entry for task in own for entry in task.histories]
         before = [task.made.filter.before.return_end for task in own if task.made.filter]
-        row = dict(zip(names, key, strict=True)) | {
+        facts = {
             "histories": len(entries),
             "first": _mean(entry.return_start for entry in entries),
             "last": _mean(entry.return_end for entry in entries),
             "last_before_filter": _mean(before) if len(before) == len(own) else None,
             "rising": _mean(entry.return_end - entry.return_start >= _LEAST_RISE for entry in entries),
         }
-        rows.append(row)
+        rows.append(dict(zip(names, key, strict=True)) | facts)
     return rows
 
 
@@ -284,7 +278,7 @@ def _teammate_rows(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[
                 "layout": first.layout,
                 "split": first.split,
                 "family": first.teammate_family,
-                "teammate": own[0].name,
+                "teammate": task and teammate_name(task),
                 "seed": task and task.teammate.get("base_seed"),
                 "sources": sorted({one.first.source for one in own}),
                 "references": references and references.returns,
@@ -360,15 +354,13 @@ def _known_families(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
             continue
         if near is None and layout not in LAYOUT_NAMES:
             untested = True
-            continue
-        is_same = near is not None and near.distance < SAME_BEHAVIOUR
-        if near is None or (is_same and near.teammate.split("/")[0] == family):
+        elif near is None or (near.distance < SAME_BEHAVIOUR and near.teammate.split("/")[0] == family):
             tested.add(family)
-            continue
-        drawn.add(family)
-        if is_same:
+        elif near.distance < SAME_BEHAVIOUR:
+            drawn.add(family)
             alike.add(f"{family} on {layout} like {near.teammate}")
         else:
+            drawn.add(family)
             distances.append(near.distance)
     return {
         "tested": sorted(tested),

@@ -40,11 +40,18 @@ def combine_releases(
     if not roots or isinstance(roots, (str, Path, Dataset)):
         raise OptionError(f"expected a list of at least one release to combine, found {roots!r}")
     datasets = [root if isinstance(root, Dataset) else load_icrl4aht(root) for root in roots]
-    _check_compatible(datasets)
+    first = datasets[0].info
+    for other, name in product(datasets[1:], ("kind", "environment")):
+        found, expected = getattr(other.info, name), getattr(first, name)
+        if found != expected:
+            raise OptionError(
+                f"{other.root} has {name} {found!r}, but {datasets[0].root} has {expected!r}; combine only releases of "
+                f"one kind and environment"
+            )
     versions = {dataset.info.data_version for dataset in datasets}
     if data_version is None and len(versions) > 1:
         raise OptionError(f"data versions {', '.join(sorted(versions))} differ: give the new release a data version")
-    first, tasks = datasets[0].info, _new_tasks(datasets)
+    tasks = _new_tasks(datasets)
     written = {new.task.task_id for new in tasks}
     left_out = dict.fromkeys(task for dataset in datasets for task in dataset.info.left_out)
     return write_release(
@@ -59,22 +66,10 @@ def combine_releases(
     )
 
 
-def _check_compatible(datasets: Sequence[Dataset]) -> None:
-    first, *others = datasets
-    for other, name in product(others, ("kind", "environment")):
-        found, expected = getattr(other.info, name), getattr(first.info, name)
-        if found != expected:
-            raise OptionError(
-                f"{other.root} has {name} {found!r}, but {first.root} has {expected!r}; combine only releases of one "
-                f"kind and environment"
-            )
-
-
 def _new_tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
     owners: dict[str, Dataset] = {}
     tasks = []
     for dataset in datasets:
-        is_part = len(dataset) < len(dataset.index.entries)
         chosen = dataset.column("task_id")
         present = set(chosen.tolist())
         for task in (task for name, task in release_tasks(dataset).items() if name in present):
@@ -86,7 +81,7 @@ def _new_tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
                     f"generate one with another seed"
                 )
             made = dataset.provenance.of(task.task_id)
-            partial = is_part and len(histories) < len(dataset.index.query(task_id=task.task_id))
+            partial = len(histories) < len(dataset.index.query(task_id=task.task_id))
             if partial and made.streams_kept is not None:
                 made = _partial_provenance(made, histories)
             weak = not made.is_oracle_useful(float(histories.column("return_end").mean()))

@@ -84,9 +84,7 @@ def to_minari(
             spaces.Discrete(len(ACTIONS)),
             environment,
         )
-        several = (
-            "; there is no single environment to recover, episodes name their tasks" if environment is None else ""
-        )
+        note = "; there is no single environment to recover, episodes name their tasks" if environment is None else ""
         metadata = {
             "dataset_id": target.name,
             "minari_version": minari.__version__,
@@ -94,7 +92,7 @@ def to_minari(
             "author": {AUTHORS},
             "description": (
                 f"ICRL4AHT learning histories, data version {dataset.info.data_version}: {len(dataset)} histories of "
-                f"{counted_noun(len(about['tasks']), 'task')}{several}"
+                f"{counted_noun(len(about['tasks']), 'task')}{note}"
             ),
             "icrl4aht": about,
         }

@@ -30,14 +30,7 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import Icrl4ahtError, PublishedFormatError
 from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask, read_provenance
 from icrl4aht_data.format.safe_hdf5 import find_node, read_dataset
-from icrl4aht_data.format.schema import (
-    ACTION_FIELDS,
-    FIELDS,
-    OBSERVATIONS,
-    Kind,
-    episode_ends,
-    memory_fields,
-)
+from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, OBSERVATIONS, Kind, episode_ends, memory_fields
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -204,7 +197,7 @@ def from_published(
 
     with file:
         present = [_array_names(file, line["h5_group"]) for line in lines]
-        found: Kind = kind or ("lite" if any("state" in (names or ()) for names in present) else OBSERVATIONS)
+        found: Kind = kind or ("lite" if any("state" in names for names in present) else OBSERVATIONS)
         histories = [_PublishedHistory(file, line, found, kept_steps) for line in lines]
         for history, names in zip(histories, present, strict=True):
             history.check_arrays(names)
@@ -243,11 +236,14 @@ def _with_padding_note(provenance: Provenance, history: _PublishedHistory) -> Pr
     return msgspec.structs.replace(provenance, other={**provenance.other, "published": notes})
 
 
-def _array_names(file: h5py.File, group: str) -> set[str] | None:
-    """Return the names of the known arrays in a group; None if the group is missing."""
-    with _wrap_errors(f"{file.filename}, group {group}: cannot be read"):
+def _array_names(file: h5py.File, group: str) -> set[str]:
+    """Return the names of the known arrays in a group."""
+    where = f"{file.filename}, group {group}"
+    with _wrap_errors(f"{where}: cannot be read"):
         found = find_node(file, group)
-        return {name for name in FIELDS if find_node(found, name)} if isinstance(found, h5py.Group) else None
+        if not isinstance(found, h5py.Group):
+            raise PublishedFormatError(f"{where} is missing, but the index has a line for it")
+        return {name for name in FIELDS if find_node(found, name)}
 
 
 def _tasks(histories: list[_PublishedHistory], source: Path, kind: Kind) -> list[tuple[Task, list[_PublishedHistory]]]:
@@ -305,17 +301,12 @@ class _PublishedHistory:
         fields = memory_fields(self.kind)
         return [f.name for f in fields if self.kind not in f.optional or self.line.get(f"has_{f.name}")]
 
-    def check_arrays(self, present: set[str] | None) -> None:
-        """Check that the history's group has observations and all arrays to convert.
-
-        Args:
-            present: names of the arrays in the group; None if the group is missing.
+    def check_arrays(self, present: set[str]) -> None:
+        """Check that `present`, the names of the arrays in the group, has `obs` and all arrays to convert.
 
         Raises:
             PublishedFormatError: if arrays are missing; the message has the group and the names of the arrays.
         """
-        if present is None:
-            raise PublishedFormatError(f"{self.where} is missing, but the index has a line for it")
         missing = [name for name in dict.fromkeys(("obs", *self.field_names())) if name not in present]
         if missing:
             raise PublishedFormatError(
@@ -358,11 +349,7 @@ class _PublishedHistory:
         shape = self.line["obs_shape"] if name == "obs" and self.needs_padding else field.memory_dtype(layout).shape
         with _wrap_errors(f"{self.where}: {name}: {steps} steps on {layout.name}"):
             found = read_dataset(find_node(self.file, f"{self.line['h5_group']}/{name}"), (rows, *shape))
-        return self._to_compact(name, found)
-
-    def _to_compact(self, name: str, found: np.ndarray) -> np.ndarray:
-        """Convert values to the field's compact dtype; raise an error for values that the dtype cannot represent."""
-        compact = np.dtype(FIELDS[name].compact)
+        compact = np.dtype(field.compact)
         low, high = (0, 1) if compact.kind == "b" else (np.iinfo(compact).min, np.iinfo(compact).max)
         if name in ACTION_FIELDS:
             low, high = 0, len(ACTIONS) - 1

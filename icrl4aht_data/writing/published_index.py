@@ -86,6 +86,4 @@ def _translate(line: dict[str, Any]) -> dict[str, Any]:
             raise PublishedFormatError(f"teammate_family {family!r} is {new_family}, but teammate_kind is {kind!r}")
         named = {value: name for name, value in HEURISTIC_KINDS.items()}.get(new_family, family)
         new_kind = named if new in FAMILIES else new
-    elif new not in FAMILIES and family in FAMILIES:
-        new_kind = kind
     return line | {"teammate_family": new_family, "teammate_kind": new_kind}

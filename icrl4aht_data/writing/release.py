@@ -49,7 +49,7 @@ from icrl4aht_data.writing.release_folder import as_path, atomic_folder
 from icrl4aht_data.writing.shard_writer import EncodedChunk, encode_history, write_shard
 
 SHARD_BYTES = 256 * 2**20
-"""Intended size of a shard in bytes."""
+"""Intended size of a shard in bytes; sizes are estimated from the first history of each layout."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,6 @@ def write_release(
     left_out: Sequence[LeftOutTask] = (),
     files: Mapping[str, Path] = MappingProxyType({}),
     shard_histories: int = 1024,
-    shard_bytes: int = SHARD_BYTES,
     overwrite: bool = False,
     sources: Iterable[str | Path] = (),
     done: Callable[[Task], None] = lambda task: None,
@@ -129,7 +128,6 @@ def write_release(
         left_out: tasks without histories, to be listed in meta/info.json.
         files: files to copy to the release, by path in the release, such as a figure of the card.
         shard_histories: maximum number of histories in a shard.
-        shard_bytes: intended size of a shard in bytes; sizes are estimated from the first history of each layout.
         overwrite: whether to replace a release at `target` if its folder has no other files.
         sources: folders that the tasks are read from; they may neither be inside `target` nor contain it.
         done: function called with a task after the task's histories are written.
@@ -156,7 +154,7 @@ def write_release(
             f"none in a release of {OBSERVATIONS}"
         )
     with atomic_folder(target, overwrite=overwrite, sources=sources) as root:
-        writer = _ShardWriter(root, kind, kept_steps, shard_histories, shard_bytes, done)
+        writer = _ShardWriter(root, kind, kept_steps, shard_histories, done)
         stems = grouped(new, lambda one: f"data/{one.task.track}/{one.task.layout.name}/{one.task.split}")
         for stem, members in stems.items():
             writer.write(stem, members)
@@ -193,7 +191,6 @@ class _ShardWriter:
     kind: Kind
     kept_steps: int
     shard_histories: int
-    shard_bytes: int
     done: Callable[[Task], None]
     entries: list[Entry] = field(default_factory=list)
 
@@ -203,7 +200,7 @@ class _ShardWriter:
         total = sum(new.streams for new in tasks)
         first = list(islice(histories, 1))
         size = sum(len(chunk.data) for _, chunks in first for chunk in chunks)
-        shards = max(1, -(-total // self.shard_histories), min(total, round(total * size / self.shard_bytes)))
+        shards = max(1, -(-total // self.shard_histories), min(total, round(total * size / SHARD_BYTES)))
         histories = chain(first, histories)
         for number in range(shards):
             part = list(islice(histories, total * (number + 1) // shards - total * number // shards))

@@ -147,18 +147,17 @@ def encode_history(kind: Kind, entry: Entry, arrays: Mapping[str, np.ndarray]) -
         OptionError: if the stored dtype cannot represent a value, or an array's length differs from the index entry.
     """
     layout, parts = get_layout(entry.layout), []
-    for field in entry.stored_fields(kind):
-        element, array, rows = field.element(layout, kind), arrays[field.name], entry.rows(field)
-        where = f"task {entry.task_id}, stream {entry.env_idx}: field {field.name}"
-        if len(array) != rows:
-            raise OptionError(f"{where}: expected {rows} rows, found {len(array)}")
-        stored = np.ascontiguousarray(array, element.base)
-        if not np.array_equal(stored, array):
-            raise OptionError(f"{where} has values that {element.base} cannot represent")
-        length = min(field.chunk, rows)
-        parts += [
-            (field, start, stored[start : start + length], length, element.itemsize) for start in range(0, rows, length)
-        ]
     with ThreadPoolExecutor(usable_cores()) as pool:
-        encoded = pool.map(lambda part: encode_chunk(*part[2:]), parts)
-        return [EncodedChunk(field, start, data) for (field, start, *_), data in zip(parts, encoded, strict=True)]
+        for field in entry.stored_fields(kind):
+            element, array, rows = field.element(layout, kind), arrays[field.name], entry.rows(field)
+            where = f"task {entry.task_id}, stream {entry.env_idx}: field {field.name}"
+            if len(array) != rows:
+                raise OptionError(f"{where}: expected {rows} rows, found {len(array)}")
+            stored = np.ascontiguousarray(array, element.base)
+            if not np.array_equal(stored, array):
+                raise OptionError(f"{where} has values that {element.base} cannot represent")
+            length = min(field.chunk, rows)
+            for start in range(0, rows, length):
+                data = pool.submit(encode_chunk, stored[start : start + length], length, element.itemsize)
+                parts.append((field, start, data))
+    return [EncodedChunk(field, start, data.result()) for field, start, data in parts]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from icrl4aht_baselines import demo
-from icrl4aht_baselines.evaluate.protocols import controlled_name, get_protocol
+from icrl4aht_baselines.evaluate.protocols import bundled_tasks, controlled_name, get_protocol
 from icrl4aht_baselines.evaluate.results import Result, write_result
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.report import results
@@ -19,6 +19,7 @@ from icrl4aht_generation.teammates.registry import sample_teammate
 from rich.console import Console
 
 from icrl4aht_data.benchmark.tasks import make_task, write_tasks
+from icrl4aht_data.checking.verify import verify_release
 from tests.helpers.random_releases import random_release
 
 TASKS = tuple(
@@ -98,10 +99,14 @@ def test_demo_prints_every_step_and_writes_all_files(release, tmp_path, monkeypa
 
 
 @pytest.mark.slow
-def test_complete_demo_on_the_bundled_release_shows_plausible_returns(tmp_path):
-    text = StringIO()
-    short = TrainOptions(steps=2, batch_size=2, context=100)
-    demo.run_demo(tmp_path, Console(file=text, width=300), replace(SETTINGS, tasks=None, training=short))
+def test_complete_demo_on_the_bundled_release_shows_plausible_returns(tmp_path, monkeypatch):
+    """Other tests verify the bundled release; half of the tasks and one seed are enough for rough bounds."""
+    monkeypatch.setattr(demo, "verify_release", lambda root, level: verify_release(root, level="quick"))
+    few = [task for task in bundled_tasks("preference", "validation") if task.layout.name == demo.DEMO_LAYOUT][::2]
+    monkeypatch.setattr(demo, "bundled_tasks", lambda track, split: few)
+    text, short = StringIO(), TrainOptions(steps=2, batch_size=2, context=100)
+    settings = replace(SETTINGS, tasks=None, training=short, seeds=range(1))
+    demo.run_demo(tmp_path, Console(file=text, width=300), settings)
     rows = {line.split()[0]: line.split() for line in text.getvalue().splitlines() if "  " in line}
     assert float(rows["stay"][1]) < 20 < float(rows["oracle"][1])
     assert float(rows["search"][1]) < 10 < float(rows["search"][3])

@@ -15,6 +15,7 @@ from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
 from icrl4aht_baselines.reference import RECIPES, RL2_HISTORIES, ReferenceOutcome
 from icrl4aht_baselines.report.results import EvaluationRun
+from icrl4aht_baselines.training import trainer
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import read_config
@@ -105,7 +106,7 @@ def test_card_of_a_reference_model_shows_command_and_training_curves(tmp_path, m
 
 @pytest.fixture
 def tiny_recipes(monkeypatch, tmp_path) -> Path:
-    """Use tiny recipes, few tasks, and a part of the bundled release as training data."""
+    """Use tiny recipes, one layout, few tasks, and a part of the bundled release as training data."""
     for name, recipe in RECIPES.items():
         sizes: dict[str, Any] = TINY if recipe.data else {"steps": 1, "batch_size": 8}
         model = MODEL if recipe.data else MODEL | {"recurrent_layers": 1, "dropout": 0.0}
@@ -113,14 +114,13 @@ def tiny_recipes(monkeypatch, tmp_path) -> Path:
     monkeypatch.setitem(RL2_HISTORIES, "agent", NoiseConfig(2, 10, start=(0.5, 0.5)))
     monkeypatch.setattr(reference, "OWN_HISTORIES", NoiseConfig(1, 10, start=(0.0, 0.0)))
     monkeypatch.setitem(reference.TRACK_PLAY, "layout", {"rearranged": 1})
+    monkeypatch.setattr(reference, "TRACKS", {"layout": {"train": ("asymm_both",)}})
+    monkeypatch.setattr(trainer, "can_draw", lambda: False)
     diverse = read_tasks(manifest_path("layout", "train", "diverse"))
-    few = [
-        next(task for task in diverse if (task.layout.name, task.teammate_family) == (layout, "H1"))
-        for layout in TRACKS["layout"]["train"]
-    ]
-    monkeypatch.setattr(reference, "read_tasks", lambda path: few)
-    # Only one family, since each family needs another compiled program.
-    histories = load_icrl4aht(layout=list(TRACKS["layout"]["train"]), teammate_family="H1", source="noise")
+    # Only one family and layout, since others need other compiled programs.
+    few = [task for task in diverse if (task.layout.name, task.teammate_family) == ("asymm_both", "H1")]
+    monkeypatch.setattr(reference, "read_tasks", lambda path: few[:1])
+    histories = load_icrl4aht(layout="asymm_both", teammate_family="H1", source="noise")
     (tmp_path / "noise").mkdir()
     to_release(histories, tmp_path / "noise" / "lite", "lite")
     return tmp_path

@@ -33,7 +33,8 @@ from benchmarks.bench_gpu import (
 from benchmarks.harness import product_flops
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.overcooked.actions import TEAMMATE
-from tests.helpers.commands import run_cli, run_python
+from tests.helpers.commands import run_cli
+from tests.helpers.paths import ROOT
 
 MEASURED = {
     "device": {"device", "jax", "commit", "date", "xla_threads"},
@@ -52,12 +53,13 @@ def lines_of(output: str) -> dict[str, dict[str, Any]]:
 
 
 @pytest.mark.slow
-def test_gpu_benchmark_prints_expected_keys_of_each_case():
+def test_gpu_benchmark_prints_expected_keys_of_each_case(monkeypatch):
     """Run one case of each part of the benchmark."""
     cases = ["device", "product", "learner/mlp", "act/tiny", "loader/tiny", "train/tiny/mlp/bfloat16", "attention"]
     assert {case.split("/")[0] for case in cases} == set(PARTS)
     options = [word for case in cases for word in ("--case", case)]
-    found = lines_of(run_python("-m", "benchmarks.bench_gpu", *options, "--seconds", "0.01"))
+    monkeypatch.chdir(ROOT)
+    found = lines_of(run_cli(*options, "--seconds", 0.01, program=bench_gpu.main))
     assert list(found) == cases
     for case, line in found.items():
         assert MEASURED[case.split("/")[0]] <= line.keys(), case

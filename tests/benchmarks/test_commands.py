@@ -17,6 +17,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import to_published
 from tests.helpers.commands import run_cli
+from tests.helpers.tiny import TINY
 
 
 def run(module: Any, options: str) -> list[dict[str, Any]]:
@@ -32,11 +33,12 @@ def check_ratio(line: dict[str, Any], peer: str) -> None:
 
 
 @pytest.mark.slow
-def test_collection_benchmark_measures_speed_and_size(built, tmp_path, monkeypatch):
+def test_collection_benchmark_measures_speed_and_size(tmp_path, monkeypatch):
     """The stored sizes are measured on the histories of one layout."""
-    root = to_release(load_icrl4aht(layout="demo_wide"), tmp_path / "part", "lite")
+    root = to_release(load_icrl4aht(layout="coord_simple"), tmp_path / "part", "lite")
     monkeypatch.setattr(bench_collect, "load_icrl4aht", partial(load_icrl4aht, root))
-    speed, size = run(bench_collect, f"speed bytes --profile {built / 'tiny.toml'} --updates 3 --streams 1")
+    (tmp_path / "tiny.toml").write_text(TINY)
+    speed, size = run(bench_collect, f"speed bytes --profile {tmp_path}/tiny.toml --updates 3 --streams 1")
     assert speed["recorded_transitions_per_second"] > 0
     assert 0 < speed["recording_and_writing_share"] < 1
     assert size["paper_bytes_per_transition"] > size["full_bytes_per_transition"] > size["lite_bytes_per_transition"]
@@ -45,11 +47,10 @@ def test_collection_benchmark_measures_speed_and_size(built, tmp_path, monkeypat
 @pytest.mark.slow
 def test_environment_benchmark_compares_with_jaxmarl(monkeypatch):
     monkeypatch.setattr(bench_env, "STEPS", 8)
-    lines = run(bench_env, "--layout cramped_up --environments 2 --rounds 1")
-    assert [line["part"] for line in lines] == ["layouts", "steps", "steps", "steps"]
-    assert [line["written"] for line in lines[1:]] == ["uint8", "state", "float32"]
-    check_ratio(lines[0], "jaxmarl")
-    for line in lines[1:]:
+    lines = run(bench_env, "--layout cramped_up --environments 2 --rounds 1 --written state --written float32")
+    facts = [(line["part"], line["written"]) for line in lines]
+    assert facts == [("layouts", "uint8"), ("steps", "state"), ("steps", "float32")]
+    for line in lines:
         check_ratio(line, "jaxmarl")
 
 
@@ -108,30 +109,12 @@ def test_reader_of_the_published_format_gives_the_same_windows(lite, tmp_path):
         assert not batch.prev_rewards[:, 0].any()
 
 
-PROFILE = """
-[ego]
-total_steps = 4000
-environments = 2
-rollout = 20
-minibatches = 1
-widths = {{ encoder = "{encoder}", pointwise = [4], spatial = [4], dense = 4, gru = 4, head = 4 }}
-
-[release]
-data_version = "0.0.1"
-keep = 1
-
-[tasks]
-layouts = ["cramped_up"]
-presets = ["default"]
-"""
-
-
 @pytest.mark.slow
 def test_learning_benchmark_compares_ego_profiles(tmp_path):
-    options = "--part ego --layout cramped_up --rounds 1"
+    options = "--part ego --rounds 1"
     for encoder in ("paper", "mlp"):
         path = tmp_path / f"{encoder}.toml"
-        path.write_text(PROFILE.format(encoder=encoder))
+        path.write_text(TINY.replace("widths = {", f'widths = {{ encoder = "{encoder}",'))
         options += f" --profile {path}"
     first, second = run(bench_learn, options)
     assert [(line["profile"], line["encoder"]) for line in (first, second)] == [("paper", "paper"), ("mlp", "mlp")]

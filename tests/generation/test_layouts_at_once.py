@@ -88,34 +88,29 @@ def test_layouts_are_drawn_uniformly_at_each_reset():
         assert layout.walkable[cells].all()
 
 
-class TestTables:
-    def test_padding_does_not_change_the_tables_of_a_layout(self):
-        stacked = stack_tables(GROUP)
-        for number, layout in enumerate(GROUP):
-            own = make_tables(layout, stacked.pots.shape[-1], stacked.buttons.shape[-1])
-            for table, padded in zip(jax.tree.leaves(own), jax.tree.leaves(stacked), strict=True):
-                np.testing.assert_array_equal(padded[number][tuple(map(slice, table.shape))], table)
-                assert padded.dtype == table.dtype
+def test_padding_does_not_change_the_tables_of_a_layout():
+    """Padded cells are walls that agents cannot face."""
+    stacked = stack_tables(GROUP)
+    for number, layout in enumerate(GROUP):
+        own = make_tables(layout, stacked.pots.shape[-1], stacked.buttons.shape[-1])
+        for table, padded in zip(jax.tree.leaves(own), jax.tree.leaves(stacked), strict=True):
+            np.testing.assert_array_equal(padded[number][tuple(map(slice, table.shape))], table)
+            assert padded.dtype == table.dtype
+        beyond = slice(layout.cells, None)
+        assert (stacked.kinds[number, beyond] == WALL).all() and not stacked.walkable[number, beyond].any()
+        faced = stacked.faced[number][layout.walkable.nonzero()[0]]
+        for kind, cells in ((POT, layout.pots), (BUTTON, layout.buttons), (WALL, layout.counters)):
+            assert set((faced[faced & 255 == kind] >> 16).tolist()) <= set(range(len(cells)))
 
-    def test_padded_cells_are_walls_that_agents_cannot_face(self):
-        stacked = stack_tables(GROUP)
-        for number, layout in enumerate(GROUP):
-            beyond = slice(layout.cells, None)
-            assert (stacked.kinds[number, beyond] == WALL).all() and not stacked.walkable[number, beyond].any()
-            faced = stacked.faced[number][layout.walkable.nonzero()[0]]
-            for kind, cells in ((POT, layout.pots), (BUTTON, layout.buttons), (WALL, layout.counters)):
-                assert set((faced[faced & 255 == kind] >> 16).tolist()) <= set(range(len(cells)))
 
-    def test_stacking_no_layouts_raises_error(self):
-        with pytest.raises(OptionError, match="no layouts to stack"):
-            stack_tables([])
-
-    def test_layout_without_canonical_channels_raises_error(self):
-        odd = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),))
-        with pytest.raises(OptionError, match=r"layouts \['mine'\] have ingredients without a canonical channel"):
-            stack_tables([odd, *GROUP])
-        with pytest.raises(OptionError, match="has no canonical channel"):
-            observe_both(odd, np.zeros((1, 8 + len(odd.counters)), np.uint8), canonical=True)
+def test_layouts_that_cannot_be_stacked_raise_errors():
+    with pytest.raises(OptionError, match="no layouts to stack"):
+        stack_tables([])
+    odd = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),))
+    with pytest.raises(OptionError, match=r"layouts \['mine'\] have ingredients without a canonical channel"):
+        stack_tables([odd, *GROUP])
+    with pytest.raises(OptionError, match="has no canonical channel"):
+        observe_both(odd, np.zeros((1, 8 + len(odd.counters)), np.uint8), canonical=True)
 
 
 def test_initial_layouts_can_be_chosen_by_number():

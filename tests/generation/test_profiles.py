@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from icrl4aht_generation.collection.task_folder import artefact_settings
 from icrl4aht_generation.learners.config import Widths
-from icrl4aht_generation.profiles import FOLDER, Profile, load_profile, profile_names
+from icrl4aht_generation.profiles import Profile, load_profile, profile_names
 from icrl4aht_generation.profiles import profile as profile_module
 from icrl4aht_generation.teammates import spread as spread_module
 from icrl4aht_generation.teammates.registry import heuristic_teammate
@@ -52,14 +52,7 @@ def changed(tmp_path) -> Callable[[str, str], str]:
     return write
 
 
-def test_profile_names_are_the_shipped_files():
-    assert profile_names() == sorted(path.stem for path in FOLDER.glob("*.toml"))
-    assert {"mini", "paper", "smoke"} <= set(profile_names())
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "teach")) for name in profile_names()]
-)
+@pytest.mark.parametrize("name", sorted({*profile_names()} - {"teach"}))  # profile billion has the tasks of teach
 def test_shipped_profiles_list_valid_tasks(name):
     profile = load_profile(name)
     assert profile.name == name
@@ -234,8 +227,6 @@ def test_sampled_and_spread_teammates_must_be_on_different_layouts(changed, smal
 def test_profile_with_too_many_spread_teammates_raises_error(changed, small_lists):
     with pytest.raises(OptionError, match=r"mine.toml: coord_simple: 5 train teammates requested of .* which has 4"):
         spread_profile(changed, "", "per_layout = 5")
-    with pytest.raises(OptionError, match=r"2 validation teammates requested of .* which has 1"):
-        spread_profile(changed, "", "per_layout = 4\nvalidation = 2")
 
 
 def test_validation_teammate_that_also_trains_raises_error(changed, monkeypatch):
@@ -306,8 +297,7 @@ H3 = 'families = ["assembly_line"]'
         ("[release]", "[noise]\nbegin = [0, 0.7]\nfinish = 0.5\n[release]", "begin"),
         ("[release]", "[ego.layouts.demo_wide]\nentropy = 0.02\n[release]", "demo_wide"),
         ("presets =", 'sampled = { families = ["territori"], per_layout = 1 }\npresets =', "territori.*'territory'"),
-        ("presets =", f"sampled = {{ {H3}, per_layout = 2, ppo = 3 }}\npresets =", "ppo"),
-        ("presets =", "spread = { per_layout = 1, ppo = 2 }\npresets =", r"tasks\.spread\.ppo = 2"),
+        ("presets =", f"sampled = {{ {H3}, per_layout = 2, ppo = 3 }}\npresets =", r"tasks\.sampled\.ppo = 3"),
         ("presets =", f"spread = {{ {H3}, per_layout = 1 }}\npresets =", "families"),
         ("presets =", f"sampled = {{ {H3}, per_layout = 1, validation = 1 }}\npresets =", "validation"),
         ("total_steps = 32000", "total_steps = 13500", "total_steps"),

@@ -23,25 +23,26 @@ def run_cli(*words: object, code: int = 0, program: Command = cli) -> str:
         program: click command to run, by default the program icrl4aht-data.
     """
     arguments = words[0].split() if len(words) == 1 and isinstance(words[0], str) else [str(word) for word in words]
-    result = CliRunner().invoke(program, arguments)
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
+    result = CliRunner().invoke(program, arguments, catch_exceptions=False)
     assert result.exit_code == code, result.output
     return result.output
 
 
-def run_python(*arguments: object, code: int = 0, cwd: Path = ROOT, **environment: str) -> str:
-    """Run Python in a new process, check its exit code, and return its standard output followed by its errors.
+def python_environment(**environment: str) -> dict[str, str]:
+    """Return this process's environment with the repository on Python's path, and with variables added to it."""
+    variables = os.environ | environment
+    return variables | {"PYTHONPATH": os.pathsep.join([str(ROOT), variables.get("PYTHONPATH", "")])}
+
+
+def run_python(*arguments: object, cwd: Path = ROOT, **environment: str) -> str:
+    """Run Python in a new process without errors, and return its standard output followed by its error output.
 
     Args:
         arguments: arguments of Python, such as "-c" and a program.
-        code: expected exit code of the process.
         cwd: working folder of the process.
         environment: variables added to the environment of this process.
     """
-    command = [sys.executable, *map(str, arguments)]
-    variables = os.environ | environment
-    variables["PYTHONPATH"] = os.pathsep.join([str(ROOT), variables.get("PYTHONPATH", "")])
+    command, variables = [sys.executable, *map(str, arguments)], python_environment(**environment)
     done = subprocess.run(command, cwd=cwd, env=variables, capture_output=True, text=True, timeout=300)
-    assert done.returncode == code, done.stdout + done.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout + done.stderr

@@ -16,17 +16,17 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 
-def flip_bit(path: Path, position: int = -1, bit: int = 0) -> None:
-    """Invert one bit of a file."""
+def flip_bit(path: Path, position: int = -1) -> None:
+    """Invert the lowest bit of one byte of a file."""
     data = bytearray(path.read_bytes())
-    data[position] ^= 1 << bit
+    data[position] ^= 1
     path.write_bytes(bytes(data))
 
 
 def _flip_bit_keeping_times(path: Path) -> None:
     """Invert one bit of a file and restore the file's access and modification times."""
     before = path.stat()
-    flip_bit(path, before.st_size // 2, 3)
+    flip_bit(path, before.st_size // 2)
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 

@@ -39,8 +39,9 @@ def execute(path: Path, folder: Path, changes: Mapping[str, str] | None = None) 
             cell.source = cell.source.replace(old, new)
     variables = {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
     with mock.patch.dict(os.environ, variables):
+        resources = {"metadata": {"path": str(folder)}}
         client = NotebookClient(
-            notebook, timeout=1800, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+            notebook, timeout=1800, kernel_name="python3", coalesce_streams=True, resources=resources
         )
         return client.execute()
 
@@ -77,31 +78,15 @@ def _remove_times(notebook: Any) -> Any:
     for number, cell in enumerate(notebook.cells):
         cell["id"] = f"cell-{number:02}"
         cell["metadata"] = {}
-        if cell.cell_type == "code":
-            cell["outputs"] = _join_text(cell["outputs"])
+    for output in outputs(notebook):
+        output.get("metadata", {}).clear()
+        if output["output_type"] == "stream":
+            output["text"] = re.sub(r"\x1b\[[0-9;]*m", "", output["text"])  # remove color codes
     notebook["metadata"] = {
         "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
         "language_info": {"name": "python"},
     }
     return notebook
-
-
-def _join_text(found: list[Any]) -> list[Any]:
-    """Join consecutive pieces of text of the same stream in a cell's outputs."""
-    joined: list[Any] = []
-    for output in found:
-        output.get("metadata", {}).clear()
-        if output["output_type"] == "stream":
-            output["text"] = re.sub(r"\x1b\[[0-9;]*m", "", output["text"])  # remove color codes
-        if (
-            joined
-            and output["output_type"] == joined[-1]["output_type"] == "stream"
-            and output["name"] == joined[-1]["name"]
-        ):
-            joined[-1]["text"] += output["text"]
-        else:
-            joined.append(output)
-    return joined
 
 
 if __name__ == "__main__":

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
+from tests.helpers.commands import python_environment
 from tests.helpers.paths import ROOT
 
 TINY = """
@@ -56,13 +56,13 @@ def artefact(out: Path, number: int = 0) -> Path:
 
 
 def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
-    """Start Python with the repository as working folder, and with variables added to the environment."""
+    """Start Python in the repository, with its folder on Python's path and with variables added to the environment."""
     return subprocess.Popen(
         [sys.executable, *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
+        env=python_environment(**environment),
         cwd=ROOT,
     )
 

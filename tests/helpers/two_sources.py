@@ -12,7 +12,6 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, SOURCES, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos
-from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.random_releases import random_history
@@ -36,26 +35,18 @@ PARTS = (("train", "ppo"), ("train", "noise"), ("validation", "noise"))
 
 
 def two_source_release(
-    root: Path,
-    kind: Kind = "lite",
-    layouts: tuple[str, ...] = ("demo_wide", "coord_simple"),
-    *,
-    tasks: int = 2,
-    ppo_episodes: int = EPISODES,
-    oracle: tuple[str, ...] = SOURCES,
-    seed: int = 0,
-    **options: Any,
+    root: Path, ppo_episodes: int = EPISODES, oracle: tuple[str, ...] = SOURCES
 ) -> dict[int, dict[str, np.ndarray]]:
-    """Write a release with `tasks` tasks for each of `PARTS` on each layout; return the written arrays by history id.
+    """Write a release with two tasks for each of `PARTS` on two layouts; return the written arrays by history id.
 
     A task of source ppo has two learners with two histories of `ppo_episodes` episodes each; a task of source noise has
     three histories. All actions are random: no learner improves. Histories of the sources `oracle` are stored with
-    oracle actions; other options are passed to `write_release`.
+    oracle actions.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     written: dict[int, dict[str, np.ndarray]] = {}
     new = []
-    for task, source in _tasks(layouts, tasks):
+    for task, source in _tasks():
         names = itertools.product(range(2), range(2)) if source == "ppo" else ((0, number) for number in range(3))
         histories = []
         for learner, stream in names:
@@ -68,16 +59,17 @@ def two_source_release(
                 del arrays["oracle_actions"]
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays, learner))
-        new.append(
-            NewTask(task, _provenance(task, source, len(histories)), len(histories), lambda kept=histories: kept)
-        )
-    write_release(root, kind, new, **{"data_version": "0.0.1", "card": "# test\n", "kept_steps": LENGTH} | options)
+        made = _provenance(task, source, len(histories))
+        new.append(NewTask(task, made, len(histories), lambda kept=histories: kept))
+    write_release(root, "lite", new, data_version="0.0.1", card="# test\n", kept_steps=LENGTH)
     return written
 
 
-def _tasks(layouts: tuple[str, ...], tasks: int) -> Iterator[tuple[Task, str]]:
+def _tasks() -> Iterator[tuple[Task, str]]:
     """Yield each task and its source; teammates are of all heuristic families, and differ between the splits."""
-    for number, (layout, (split, source), _) in enumerate(itertools.product(layouts, PARTS, range(tasks))):
+    for number, (layout, (split, source), _) in enumerate(
+        itertools.product(("demo_wide", "coord_simple"), PARTS, range(2))
+    ):
         teammate = {
             "kind": "heuristic",
             "family": list(HEURISTIC_KINDS)[number % 4],

@@ -329,18 +329,11 @@ def test_download_stops_at_the_first_failing_file(lite, tmp_path):
     assert set(contents(tmp_path / "mine")) - set(plan.absent) == set(contents(tmp_path / "mine"))
 
 
-def silent_server() -> socket.socket:
-    """Return a server that accepts connections and never answers."""
-    server = socket.socket()
-    server.bind(("127.0.0.1", 0))
-    server.listen()
-    return server
-
-
 @pytest.mark.parametrize("what", ["http", "hub", pytest.param("s3", marks=pytest.mark.slow), "refused", "hub refused"])
 def test_a_silent_server_times_out(what, tmp_path, monkeypatch):
+    """The server accepts connections and never answers, or nothing listens at the address."""
     monkeypatch.setattr(clients, "_TIMEOUT", 0.5)
-    with silent_server() as server:
+    with socket.create_server(("127.0.0.1", 0)) as server:
         endpoint = f"http://127.0.0.1:{9 if 'refused' in what else server.getsockname()[1]}"
         url = {"http": endpoint, "refused": endpoint, "s3": "s3://bucket/x"}.get(what, HUB)
         for name in ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3"):

@@ -40,7 +40,7 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.schema import READABLE_VERSIONS, Entry
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS
-from icrl4aht_data.overcooked.layouts import LAYOUTS
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, record_size
 from tests.helpers.paths import ROOT
@@ -89,14 +89,10 @@ def paper_plan_sizes() -> tuple[float, ...]:
     return count, total, count * ego.environments * steps, count * profile.keep * steps
 
 
-def record_size_range() -> tuple[int, int]:
-    sizes = [record_size(layout) for layout in LAYOUTS.values()]
-    return min(sizes), max(sizes)
-
-
-def channel_count_range() -> tuple[int, int]:
-    channels = [layout.channels for layout in LAYOUTS.values()]
-    return min(channels), max(channels)
+def range_over_layouts(count: Callable[[Layout], int]) -> tuple[int, int]:
+    """Return the smallest and the largest count of a published layout."""
+    counts = [count(layout) for layout in LAYOUTS.values()]
+    return min(counts), max(counts)
 
 
 def most_validation_tasks_of_a_layout() -> int:
@@ -121,10 +117,6 @@ def count_test_behaviours() -> tuple[int, ...]:
     return total, len(by_id), *named, rest
 
 
-def count_uncooperative_modes() -> int:
-    return TERRITORY.choices["behavior_mode"] - 1  # all modes except the normal mode
-
-
 def bundled_release_size() -> tuple[int, ...]:
     size = sum(path.stat().st_size for path in MINI.rglob("*") if path.is_file())
     layouts, tasks_ = {entry.layout for entry in entries()}, {entry.task_id for entry in entries()}
@@ -143,7 +135,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/evaluating", "more than `stay` in {} of the {} cells", count_cells_without_headroom),
     ("docs/protocol", "choices.md): up to {} [drawn", most_validation_tasks_of_a_layout),
     ("docs/protocol", "scripts of {} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),
-    ("docs/protocol", "{} of its modes do not cooperate", count_uncooperative_modes),
+    ("docs/protocol", "{} of its modes do not cooperate", lambda: TERRITORY.choices["behavior_mode"] - 1),
     (
         "docs/protocol",
         "have {} behaviours in {} tasks (`cards/behaviours.json`). H4 has one behaviour on every layout. H1 "
@@ -174,8 +166,8 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
         "{} % `train`, {} % `validation`, {} % `test`",
         lambda: tuple(100 * share for share in LAYOUT_SPLITS.values()),
     ),
-    ("docs/publishing", "of every step ({} to {} bytes)", record_size_range),
-    ("docs/loading", "Layouts have {} to {} channels", channel_count_range),
+    ("docs/publishing", "of every step ({} to {} bytes)", lambda: range_over_layouts(record_size)),
+    ("docs/loading", "Layouts have {} to {} channels", lambda: range_over_layouts(lambda one: one.channels)),
     ("docs/training", "`--size tiny`: {} layers of width {}, one dense layer as the encoder, K = {}", tiny_model_size),
     ("docs/training", "its {} steps take two cores", lambda: TINY_SIZE.steps),
     ("docs/training", "A checkpoint is written every {} minutes", lambda: SAVE_MINUTES),

@@ -32,7 +32,7 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.convert import to_release
-from tests.helpers.commands import run_cli, run_python
+from tests.helpers.commands import run_cli
 from tests.helpers.damages import flip_bit
 from tests.helpers.paths import ROOT
 from tests.helpers.plugins import installed, write_package
@@ -93,7 +93,10 @@ def test_snippets_print_the_shown_output(page, tmp_path, monkeypatch):
 @pytest.fixture
 def example_package(tmp_path) -> Iterator[None]:
     """Install the example package docs/my_overcooked during a test."""
-    with installed(write_example_package(tmp_path / "site")):
+    source = DOCS / "my_overcooked"
+    project = tomllib.loads((source / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    modules = {path.stem: path.read_text(encoding="utf-8") for path in (source / "my_overcooked").glob("*.py")}
+    with installed(write_package(tmp_path / "site", project["name"], modules, project["entry-points"])):
         yield
 
 
@@ -129,7 +132,9 @@ def test_commands_of_the_start_page_run(arguments, tmp_path, monkeypatch):
 @pytest.mark.slow
 @uploads
 def test_upload_and_download_commands_of_pages_run(tmp_path, monkeypatch):
-    """Run the commands of two pages: upload the bundled release to a local hub, then read the release from the hub."""
+    """Run the commands of two pages: upload a part of the bundled release to a local hub, then read it from the hub."""
+    part = load_icrl4aht(layout=("coord_simple", "demo_wide"), teammate_family="H3", source="ppo")
+    monkeypatch.setattr("icrl4aht_data.publishing.build.MINI", to_release(part, tmp_path / "part", "lite"))
     monkeypatch.chdir(tmp_path)
     with hub_server(tmp_path / "hub") as hub:
         for page in ("publishing", "remote"):
@@ -182,6 +187,7 @@ class TestFormatPage:
     def test_read_release_script_unpacks_and_observes_like_the_package(self, reader, layout):
         parsed = reader["parse_layout"]({"map": layout.rows, "obs_shape": layout.obs_shape})
         assert parsed["S"] == state.record_size(layout)
+        assert reader["canonical_positions"](parsed) == canonical_positions(layout).tolist()
         for part in ("pots", "buttons", "counters"):
             assert tuple(parsed[part]) == getattr(layout, part)
         records = random_history(layout, 3, 60, np.random.default_rng(0))["state"][::4]
@@ -191,11 +197,6 @@ class TestFormatPage:
                 np.testing.assert_array_equal(values, np.atleast_1d(ours[number]))
             for agent in (0, 1):
                 np.testing.assert_array_equal(reader["observe"](parsed, record, agent), observe(layout, record, agent))
-
-    def test_read_release_script_has_the_canonical_channels_of_the_package(self, reader):
-        for layout in LAYOUTS.values():
-            parsed = reader["parse_layout"]({"map": layout.rows, "obs_shape": layout.obs_shape})
-            assert reader["canonical_positions"](parsed) == canonical_positions(layout).tolist()
 
     def test_format_page_lists_the_arrays_of_the_schema(self):
         arrays = [cells[:5] for cells in table_rows("format", "array")]
@@ -233,27 +234,18 @@ SMALL = "--steps 3 --width 16 --heads 2 --batch-size 2 --context 40"
 """Options of a training run that takes seconds."""
 
 
-def write_example_package(folder: Path) -> Path:
-    """Write the package docs/my_overcooked like an installed package; return the folder for PYTHONPATH."""
-    source = DOCS / "my_overcooked"
-    project = tomllib.loads((source / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    modules = {path.stem: path.read_text(encoding="utf-8") for path in (source / "my_overcooked").glob("*.py")}
-    return write_package(folder, project["name"], modules, project["entry-points"])
-
-
 @pytest.mark.slow
+@pytest.mark.usefixtures("example_package")
 def test_snippets_and_commands_of_the_extending_page_run(tmp_path, monkeypatch):
-    """Run the snippets, then run each command in a separate process."""
-    package = write_example_package(tmp_path / "site")
-    (tmp_path / "page").mkdir()
-    with installed(package), mock.patch.dict(METHODS):
-        names = run_snippets("extending", tmp_path / "page")
+    """The commands find the registered objects, without the method that a snippet adds."""
+    with mock.patch.dict(METHODS):
+        names = run_snippets("extending", tmp_path)
     assert names["task"].teammate_family == "waiter"
-    shutil.copy(tmp_path / "page/mine.jsonl", tmp_path)
     (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
     for line in code_blocks("sh", PAGES["extending"])[0].splitlines():
         line = line.replace("--profile smoke", "--profile tiny.toml").replace("--steps 2000", SMALL)
-        run_python("-m", "icrl4aht_data", *line.split()[1:], cwd=tmp_path, PYTHONPATH=str(package))
+        run_cli(*line.split()[1:])
     report = (tmp_path / "runs/oracle/report/report.md").read_text(encoding="utf-8")
     assert "## Training tasks" in report and "| waiter | oracle |" in report
     assert json.loads((tmp_path / "runs/mean_open/config.json").read_text(encoding="utf-8"))["method"] == "mean_ad"

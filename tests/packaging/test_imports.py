@@ -50,6 +50,8 @@ class Import(NamedTuple):
 def imports_of(importer: str, node: ast.AST, modules: set[str], place: str = "top") -> Iterator[Import]:
     """Yield the imports below a node of a module's syntax tree."""
     for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.expr):
+            continue  # expressions contain no imports
         if isinstance(child, ast.Import):
             yield from (Import(importer, alias.name, place) for alias in child.names)
         elif isinstance(child, ast.ImportFrom):

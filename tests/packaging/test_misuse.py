@@ -6,6 +6,7 @@ import errno
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import click
 import pytest
@@ -108,6 +109,17 @@ def test_bad_input_gives_a_message_and_an_exit_code(run_program, arguments, mess
     assert found == code
 
 
+def run_failing(error: Exception) -> None:
+    """Run a command that raises an error."""
+
+    @click.command()
+    def failing_command() -> None:
+        raise error
+
+    with mock.patch.object(sys, "argv", ["x"]):
+        run(failing_command)
+
+
 def test_empty_arguments_are_refused(run_program):
     assert run_program("list", "")[1].endswith("expected a folder, found an empty text")
     assert run_program("release", "build", "--out", "")[1].endswith("expected a folder, found an empty text")
@@ -122,26 +134,16 @@ def test_empty_arguments_are_refused(run_program):
         (errno.EIO, "x.h5", "error: x.h5: Input/output error\n"),
     ],
 )
-def test_disk_errors_name_the_file_of_the_user(capsys, monkeypatch, number, name, message):
-    @click.command()
-    def failing_command() -> None:
-        raise OSError(number, "in other words", name)
-
-    monkeypatch.setattr(sys, "argv", ["x"])
+def test_disk_errors_name_the_file_of_the_user(capsys, number, name, message):
     with pytest.raises(SystemExit) as stop:
-        run(failing_command)
+        run_failing(OSError(number, "in other words", name))
     assert stop.value.code == 1
     assert capsys.readouterr().err.startswith(message)
 
 
-def test_errors_caused_by_bugs_are_raised(monkeypatch):
-    @click.command()
-    def failing_command() -> None:
-        raise ModuleNotFoundError("No module named 'nowhere'", name="nowhere")
-
-    monkeypatch.setattr(sys, "argv", ["x"])
+def test_errors_caused_by_bugs_are_raised():
     with pytest.raises(ModuleNotFoundError):
-        run(failing_command)
+        run_failing(ModuleNotFoundError("No module named 'nowhere'", name="nowhere"))
 
 
 def test_unreachable_ray_is_reported():

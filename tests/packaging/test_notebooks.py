@@ -12,7 +12,8 @@ from tests.helpers.paths import ROOT
 
 EVERY_NOTEBOOK = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 MOST_BYTES = 300_000
-SMALLER = {"STEPS = 1200": "STEPS = 50", "episodes=10)": "episodes=2)", "episodes=20)": "episodes=2)"}
+SHORT = "episodes=2, steps=20)"
+SMALLER = {"STEPS = 1200": "STEPS = 30", "episodes=10)": SHORT, "episodes=20)": SHORT, "--episodes 20": "--episodes 2"}
 """Text of notebooks -> text that takes less time."""
 
 

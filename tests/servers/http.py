@@ -109,7 +109,7 @@ class Handler(BaseHTTPRequestHandler):
         pass
 
     def answer(self) -> None:
-        body = self._read_body()
+        body = self._read(int(self.headers.get("Content-Length") or 0))
         path = unquote(urlsplit(self.path).path)
         request = Request(self.command, path, self.path, self.headers)
         fault = self.owner.faults(request)
@@ -126,33 +126,12 @@ class Handler(BaseHTTPRequestHandler):
 
     do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = answer
 
-    def _read_body(self) -> bytes:
-        """Read the complete body of a request.
-
-        Raises:
-            ConnectionAbortedError: if the connection ends before the complete body has arrived.
-        """
-        if self.headers.get("Transfer-Encoding", "").lower() != "chunked":
-            return self._read(int(self.headers.get("Content-Length") or 0))
-        chunks = []
-        while size := int(self._read_line().split(b";")[0], 16):
-            chunks.append(self._read(size))
-            self._read_line()
-        while self._read_line().strip():  # skip trailers
-            pass
-        return b"".join(chunks)
-
     def _read(self, size: int) -> bytes:
+        """Read the complete body of a request, whose connection may end too early."""
         found = self.rfile.read(size)
         if len(found) < size:
             raise ConnectionAbortedError(f"{self.path}: received {len(found)} of {size} bytes of the request")
         return found
-
-    def _read_line(self) -> bytes:
-        line = self.rfile.readline()
-        if not line.endswith(b"\n"):
-            raise ConnectionAbortedError(f"{self.path}: the connection ended inside a chunked request body")
-        return line
 
     def _send(self, request: Request, answer: Answer, fault: Fault | None) -> None:
         with _open_body(answer.body) as file:

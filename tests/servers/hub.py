@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import threading
 from collections.abc import Iterator
@@ -76,12 +75,8 @@ class Hub(HubState):
         return Refusal(404, "Sorry, we can't find the page you are looking for.").answer
 
     def _serve_blob(self, request: Request, body: bytes) -> Answer:
-        _, _, sha256, *_ = [*request.path.split("/"), "", ""]
-        if re.fullmatch("[0-9a-f]{64}", sha256) is None:
-            return Answer(b"no such object\n", 404)
+        sha256 = request.path.split("/")[2]
         if request.method == "PUT":
-            if hashlib.sha256(body).hexdigest() != sha256:
-                return Answer(b"the content does not match the announced SHA-256\n", 400)
             with self._lock:
                 self.blobs.add(body, lfs=True)
             return Answer()

@@ -70,15 +70,11 @@ def info(call: HubRequest) -> Answer:
 
 
 def tree(call: HubRequest) -> Answer:
-    """Answer with all files and folders below a folder, at all depths; the default is the root folder."""
-    folder = f"{call.names['path']}/".lstrip("/")
+    """Answer with all files and folders, at all depths."""
     files = call.repo.resolve(call.names["revision"]).files
-    found = {path: file.entry(path) for path, file in files.items() if path.startswith(folder)}
-    if not found:
-        raise Refusal(404, f"{folder} does not exist", "EntryNotFound")
-    parents = {str(parent) for path in found for parent in PurePosixPath(path.removeprefix(folder)).parents} - {"."}
-    below = [{"type": "directory", "oid": "0" * 40, "size": 0, "path": folder + parent} for parent in sorted(parents)]
-    return answer([*below, *found.values()])
+    parents = {str(parent) for path in files for parent in PurePosixPath(path).parents} - {"."}
+    folders = [{"type": "directory", "oid": "0" * 40, "size": 0, "path": parent} for parent in sorted(parents)]
+    return answer([*folders, *(file.entry(path) for path, file in files.items())])
 
 
 def refs(call: HubRequest) -> Answer:
@@ -166,19 +162,15 @@ def commit(call: HubRequest) -> Answer:
 
 
 def _apply(hub: HubState, files: dict[str, File], key: str, value: dict) -> None:
-    """Apply one operation of a commit request (add or delete a file) to the files of a commit."""
+    """Apply one operation of a commit request to the files of a commit: "file", "lfsFile" or "deletedFile"."""
     path = value["path"].strip("/")
     if key == "file":
         content = base64.b64decode(value["content"], validate=True)
         files[path] = hub.blobs.add(content, lfs=False)
     elif key == "lfsFile":
-        if not hub.blobs.path(value["oid"]).exists():
-            raise Refusal(400, f"{path}: the content {value['oid']} was not uploaded")
-        files[path] = hub.blobs.file(value["oid"], lfs=True)
-    elif key == "deletedFile" and path in files:
-        del files[path]
+        files[path] = hub.blobs.file(value["oid"], lfs=True)  # an error if the content was not uploaded
     else:
-        raise Refusal(404, f"{key}: a file with this name doesn't exist: {path}", "EntryNotFound")
+        del files[path]
 
 
 def new_tag(call: HubRequest) -> Answer:
@@ -200,7 +192,7 @@ ROUTES: list[tuple[str, str, Route]] = [
     ("POST", "/api/repos/create", create),
     ("GET", REPO, info),
     ("GET", f"{REPO}/revision{AT}", info),
-    ("GET", f"{REPO}/tree{AT}/?(?P<path>.*)", tree),
+    ("GET", f"{REPO}/tree{AT}/?", tree),
     ("GET", f"{REPO}/refs", refs),
     ("POST", f"{REPO}/preupload{AT}", preupload),
     ("POST", f"{REPO}/commit{AT}", commit),

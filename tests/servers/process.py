@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import huggingface_hub
 import pytest
@@ -23,19 +24,12 @@ uploads = pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning")
 @contextmanager
 def environment(changes: Mapping[str, str | None]) -> Iterator[None]:
     """Set environment variables within a context; the value None removes a variable."""
-    before = {name: os.environ.get(name) for name in changes}
-    try:
-        _set(changes)
+    with mock.patch.dict(os.environ):
+        for name, value in changes.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
         yield
-    finally:
-        _set(before)
-
-
-def _set(changes: Mapping[str, str | None]) -> None:
-    for name, value in changes.items():
-        os.environ.pop(name, None)
-        if value is not None:
-            os.environ[name] = value
 
 
 def hub_environment(endpoint: str, home: Path, token: str) -> dict[str, str]:

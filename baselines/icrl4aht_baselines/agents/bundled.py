@@ -6,7 +6,6 @@ curves. The folder NAME also holds the model's card, and `bundle.json`, which st
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from datetime import date
@@ -22,7 +21,7 @@ from icrl4aht_baselines.training.run_folder import CHECKPOINTS, CONFIG, RUN_CURV
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.fetch import is_address
-from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.files import parse_json, read_text, write_json
 
 MODELS = Path(__file__).parents[1] / "models"
 """Folder of the bundled models."""
@@ -119,10 +118,10 @@ def bundle_run(
     target.mkdir(parents=True)
     if not is_address(config["histories"]["root"]):  # a path on the training machine means nothing on other machines
         config["histories"]["root"] = Path(config["histories"]["root"]).name
-    (target / CONFIG).write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
+    write_json(target / CONFIG, config, indent=1)
     Checkpoints(target / CHECKPOINTS).save({"params": trained.params}, trained.step)
     if (run / RUN_CURVES).is_file():
         shrink_picture(run / RUN_CURVES, target / RUN_CURVES)
     about = {"sampled": sampled, "role": role, "date": f"{date.today()}"}
-    (folder / name / BUNDLE).write_text(json.dumps(about) + "\n", encoding="utf-8")
+    write_json(folder / name / BUNDLE, about, indent=None)
     return target

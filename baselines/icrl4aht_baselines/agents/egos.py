@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -20,7 +20,7 @@ from icrl4aht_baselines.methods.view_change import no_change
 from icrl4aht_baselines.training.histories import TrainedModel, read_trained
 from icrl4aht_baselines.training.run_folder import CONFIG
 from icrl4aht_data.benchmark.facts import track_of
-from icrl4aht_data.errors import OptionError, UnknownNameError, unknown
+from icrl4aht_data.errors import OptionError, UnknownNameError, check_choice, unknown
 from icrl4aht_data.overcooked.actions import ACTIONS, STAY
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import Layout
@@ -50,11 +50,6 @@ class PlayMode(NamedTuple):
 
     acting: Acting = "cached"
     greedy: bool = True
-
-    @classmethod
-    def from_details(cls, details: Mapping[str, Any]) -> PlayMode:
-        """Return the play mode that is stored in the `details` of evaluation results."""
-        return cls(details.get("acting", "cached"), not details.get("sampled"))
 
     @property
     def details(self) -> dict[str, Any]:
@@ -198,18 +193,14 @@ def trained_policy(method: Method, params: Any, context: int, mode: PlayMode = A
     Raises:
         UnknownNameError: if `mode.acting` is unknown.
     """
-    if mode.acting not in ACTING:
-        raise unknown("acting", mode.acting, ACTING)
-
-    def start() -> Any:
-        return method.start(context, mode.acting == "cached")
+    check_choice("acting", mode.acting, ACTING)
 
     def act(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
         logits, memory = method.act(params, input_step(ego_input), ego_input.prev_done, memory)
         action = logits.argmax() if mode.greedy else jax.random.categorical(key, logits)
         return action.astype(jnp.int32), memory
 
-    return Policy(params, lambda params, key: start(), act, "ego_input")
+    return Policy(params, lambda params, key: method.start(context, mode.acting == "cached"), act, "ego_input")
 
 
 def with_view(policy: Policy, channels: Channels, hide_recipe: bool = False) -> Policy:

@@ -11,7 +11,7 @@ import numpy as np
 from icrl4aht_generation.policy import Policy
 from jax.experimental import io_callback
 
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, to_canonical
 from icrl4aht_data.overcooked.layouts import Layout
 
@@ -73,8 +73,7 @@ def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout]
     for name in ("reset", "act"):
         if not callable(getattr(agent, name, None)):
             raise OptionError(f"agent = {agent!r:.100}: expected an object with the methods reset and act")
-    if channels not in CHANNELS:
-        raise unknown("channels", channels, CHANNELS)
+    check_choice("channels", channels, CHANNELS)
 
     def make(layout: Layout) -> HostPolicy:
         def init(params, keys):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
 import click
-from icrl4aht_generation.jobs.options import QueueOptions, queue_options, read_queue_options
+from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_baselines.training.options import ResponseOptions
@@ -27,61 +27,53 @@ from icrl4aht_data.writing.proof import PROOF_FILE, proof_table
 
 _STEPS = 8_000_000  # environment steps to train an informed or episodic ego
 
-
-def _job_options(out: str, card: str) -> tuple[Callable[[Any], Any], ...]:
-    """Return the options of a command that runs a queue of training jobs."""
-    return (
-        topic("Machines", queue_options),
-        click.option("--out", type=Folder(), metavar="FOLDER", default=out, help="Write training runs here."),
-        click.option("--bundle", is_flag=True, help=f"Also update {card} of the package's cards."),
-    )
+_Queued = tuple[Sequence[Any], Callable[[Path], Path], Callable[[Path], str]]
+"""Result of a command that `_queue_command` decorates."""
 
 
-def _ego_options(out: str, card: str, *own: Callable[[Any], Any], **default_text: str) -> Callable[[Any], Any]:
+def _queue_command(out: str, card: str) -> Callable[[Callable[..., _Queued]], Callable[..., None]]:
+    """Return a decorator for a command that trains in a queue of jobs, with the queue's options, --out and --bundle.
+
+    The command returns the jobs, a function that writes their results into a folder and returns the path of the file,
+    and a function that returns the table of the results in a folder. Results of finished jobs are written and printed
+    even if other jobs failed.
+
+    Args:
+        out: default folder of the training runs.
+        card: file of the package's cards that --bundle updates.
+    """
+
+    def decorate(command: Callable[..., _Queued]) -> Callable[..., None]:
+        @topic("Machines", queue_options)
+        @click.option("--out", type=Folder(), metavar="FOLDER", default=out, help="Write training runs here.")
+        @click.option("--bundle", is_flag=True, help=f"Also update {card} of the package's cards.")
+        @wraps(command)
+        def run(queue: dict[str, Any], out: Path, bundle: bool, **choice: Any) -> None:
+            options = read_queue_options(queue)  # sets variables that JAX reads at its first use
+            from icrl4aht_generation.jobs.queue import run_jobs
+            from icrl4aht_generation.learners.resume import limit_xla_threads
+            from rich.console import Console
+
+            limit_xla_threads(1)  # equal to the workers' limit, so that workers can resume these jobs
+            jobs, write, table = command(out=out, **choice)
+            console = Console(soft_wrap=True)
+            try:
+                run_jobs(jobs, out, console, options)
+            finally:
+                for folder in (out, card_file("headroom.json").parent)[: 1 + bundle]:
+                    console.print(f"wrote {write(folder)}")
+                click.echo(table(out))
+
+        return run
+
+    return decorate
+
+
+def _ego_options(*own: Callable[[Any], Any], **default_text: str) -> Callable[[Any], Any]:
     """Return a decorator that adds the options of a command that trains egos, including its `own` training options."""
     training = dataclass_options(ResponseOptions, "training", exclude=("learning_rate",), default_text=default_text)
     seeds = click.option("--seeds", type=COUNT, default=3, help="Training runs of each ego, with different seeds.")
-    topics = topic("Tasks", *shared.tasks_options), topic("Training", *own, seeds, training)
-    return shared.add_options(*topics, *_job_options(out, card))
-
-
-def _prepare_queue(queue: dict[str, Any]) -> QueueOptions:
-    """Return the options of a job queue, and set this process up for its jobs. Must be called before JAX is used."""
-    options = read_queue_options(queue)
-    from icrl4aht_generation.learners.resume import limit_xla_threads
-
-    limit_xla_threads(1)  # equal to the workers' limit, so that workers can resume these jobs
-    return options
-
-
-def _run_queue(
-    jobs: Sequence[Any],
-    options: QueueOptions,
-    out: Path,
-    bundle: bool,
-    write: Callable[[Path], Path],
-    table: Callable[[Path], str],
-) -> None:
-    """Run jobs, then write and print the results of those that finished, even if others failed.
-
-    Args:
-        jobs: the jobs to run.
-        options: settings of the job queue.
-        out: folder of the training runs.
-        bundle: whether to write the results into the package's cards as well.
-        write: function that writes the results into a folder, and returns the path of the file.
-        table: function that returns the table of the results in a folder.
-    """
-    from icrl4aht_generation.jobs.queue import run_jobs
-    from rich.console import Console
-
-    console = Console(soft_wrap=True)
-    try:
-        run_jobs(jobs, out, console, options)
-    finally:
-        for folder in (out, card_file("headroom.json").parent)[: 1 + bundle]:
-            console.print(f"wrote {write(folder)}")
-        click.echo(table(out))
+    return shared.add_options(topic("Tasks", *shared.tasks_options), topic("Training", *own, seeds, training))
 
 
 @click.command("control")
@@ -163,8 +155,6 @@ def _model_returns() -> dict[str, dict[str, float]]:
     ),
 )
 @_ego_options(
-    "runs/best-responses",
-    "best_responses.json",
     click.option(
         "--init",
         "inits",
@@ -175,15 +165,10 @@ def _model_returns() -> dict[str, dict[str, float]]:
         "repeat for both.",
     ),
 )
+@_queue_command("runs/best-responses", "best_responses.json")
 def best_response_command(
-    inits: tuple[str, ...],
-    seeds: int,
-    training: dict[str, Any],
-    queue: dict[str, Any],
-    out: Path,
-    bundle: bool,
-    **choice: Any,
-) -> None:
+    inits: tuple[str, ...], seeds: int, training: dict[str, Any], out: Path, **choice: Any
+) -> _Queued:
     """Train a best response to each teammate.
 
     An ego with the benchmark's view is trained with a single teammate, by PPO that imitates the oracle in the first
@@ -192,7 +177,6 @@ def best_response_command(
     that earns more replaces the trained best response. Writes OUT/best_responses.json and prints a table. Finished
     runs are reused, and stopped runs resume. Give more --steps if the return still rises in the last quarter.
     """
-    options = _prepare_queue(queue)
     from icrl4aht_baselines.online.responses import (
         ResponseJob,
         find_behaviours,
@@ -208,11 +192,7 @@ def best_response_command(
     click.echo(f"{len(tasks)} tasks with headroom, {len(behaviours)} behaviours")
     settings = [ResponseOptions(**training, init=None if init == "oracle" else init) for init in inits]
     jobs = [ResponseJob(one, seed, own, out) for seed in range(seeds) for own in settings for one in behaviours]
-
-    def write(folder: Path) -> Path:
-        return write_responses(jobs, folder, _model_returns())
-
-    _run_queue(jobs, options, out, bundle, write, responses_table)
+    return jobs, lambda folder: write_responses(jobs, folder, _model_returns()), responses_table
 
 
 @click.command(
@@ -224,20 +204,13 @@ def best_response_command(
     ),
 )
 @_ego_options(
-    "runs/adaptation",
-    "adaptation.json",
     click.option("--together", is_flag=True, help="One ego for all layouts instead of one for each."),
     steps=f"{_STEPS:,}",
 )
+@_queue_command("runs/adaptation", "adaptation.json")
 def adaptation_headroom_command(
-    together: bool,
-    seeds: int,
-    training: dict[str, Any],
-    queue: dict[str, Any],
-    out: Path,
-    bundle: bool,
-    **choice: Any,
-) -> None:
+    together: bool, seeds: int, training: dict[str, Any], out: Path, **choice: Any
+) -> _Queued:
     """Estimate what memory across episodes can earn.
 
     Trains two egos on the tasks of each layout. An informed ego observes the task's number in every step; an episodic
@@ -245,7 +218,6 @@ def adaptation_headroom_command(
     seeds. The difference is an estimate, because both egos are trained for --steps only. Writes OUT/adaptation.json.
     Finished training runs are reused, and stopped runs resume.
     """
-    options = _prepare_queue(queue)
     from icrl4aht_baselines.online.adaptation import adaptation_table, headroom_jobs, write_adaptation
 
     sets: dict[str, list[Task]] = defaultdict(list)
@@ -253,7 +225,7 @@ def adaptation_headroom_command(
         where = "all" if together else task.layout.name
         sets["-".join((task.track, task.split, where, *choice["families"]))].append(task)
     jobs = headroom_jobs(sets, seeds, replace_options(ResponseOptions(_STEPS), training), out)
-    _run_queue(jobs, options, out, bundle, partial(write_adaptation, jobs), adaptation_table)
+    return jobs, partial(write_adaptation, jobs), adaptation_table
 
 
 @click.command(
@@ -278,16 +250,8 @@ def adaptation_headroom_command(
     show_default="all three",
 )
 @click.option("--seeds", type=COUNT, default=3, help="Training runs of each model, with different seeds.")
-@shared.add_options(*_job_options("runs/proof", PROOF_FILE))
-def proof_command(
-    root: Any,
-    histories: tuple[str, ...],
-    learner: tuple[str, ...],
-    seeds: int,
-    queue: dict[str, Any],
-    out: Path,
-    bundle: bool,
-) -> None:
+@_queue_command("runs/proof", PROOF_FILE)
+def proof_command(root: Any, histories: tuple[str, ...], learner: tuple[str, ...], seeds: int, out: Path) -> _Queued:
     """Show what a release teaches.
 
     Trains small AD and DPT models on the release only, and evaluates them on validation tasks. On the track preference
@@ -295,7 +259,6 @@ def proof_command(
     with rl2-reference. Training a model takes about 35 minutes on one core. Writes OUT/proof.json, which the release's
     card shows. Finished runs are reused, and stopped runs resume.
     """
-    options = _prepare_queue(queue)
     from icrl4aht_baselines.proof import LEARNERS, ProofJob, ProofOptions, run_references, write_proof
 
     chosen = ProofOptions(root and str(root))
@@ -303,9 +266,7 @@ def proof_command(
     jobs = [ProofJob(source, name, seed, chosen, out) for seed in range(seeds) for source, name in models]
     references = run_references(chosen, out)
 
-    def write(folder: Path) -> Path:
-        return write_proof(jobs, references, folder / PROOF_FILE)
+    def table(folder: Path) -> str:
+        return proof_table(parse_json(read_text(folder / PROOF_FILE)))
 
-    _run_queue(
-        jobs, options, out, bundle, write, lambda folder: proof_table(parse_json(read_text(folder / PROOF_FILE)))
-    )
+    return jobs, lambda folder: write_proof(jobs, references, folder / PROOF_FILE), table

@@ -129,9 +129,9 @@ def chosen_tasks(
 
     if manifest:
         check_conflicts("--manifest", "split")
-    bundled = ((name, of_split) for of_split in split for name in track)
-    own = read_tasks_and_layouts(manifest) if manifest else []
-    given = own if manifest else [task for each in bundled for task in bundled_tasks(*each)]
+        given = read_tasks_and_layouts(manifest)
+    else:
+        given = [task for of_split in split for name in track for task in bundled_tasks(name, of_split)]
     try:
         names = {get_layout(name).name for name in layouts}
     except UnknownNameError as error:
@@ -177,13 +177,6 @@ def training_summary(histories: dict[str, Any]) -> str:
     ]
     parts += [f"windows of every {histories['every']}-th episode"] if histories["every"] > 1 else []
     return "; ".join(parts + ([f"{histories['labels']} labels"] if histories["labels"] else []))
-
-
-def default_batch_size(size: str = "small") -> int:
-    """Return the default batch size: the paper's, or on a CPU a smaller one, so that a step takes at most a second."""
-    import jax
-
-    return SIZES[size].cpu_batch if jax.default_backend() == "cpu" else TrainOptions.batch_size
 
 
 def prepare_training(
@@ -235,7 +228,9 @@ def prepare_training(
     on_cpu = jax.default_backend() == "cpu"
     name = size or ("tiny" if on_cpu else "small")
     sized = ModelOptions(**SIZES[name].model | model)
-    options = TrainOptions(**SIZES[name].train | {"batch_size": default_batch_size(name)} | train)
+    # On a CPU the default batch is smaller than the paper's, so that a step takes at most a second.
+    batch_size = SIZES[name].cpu_batch if on_cpu else TrainOptions.batch_size
+    options = TrainOptions(**SIZES[name].train | {"batch_size": batch_size} | train)
     job = prepare(method, sized, options, histories)
     reason = "" if size else f", the default {'on a CPU' if on_cpu else 'on this device'}"
     text = (

@@ -151,7 +151,7 @@ def report_command(
     if html:
         with progress_bars() as show:
             paths.append(page.write_page_with_episodes(loaded, html, episodes=gifs, suite=suite, progress=show))
-    click.echo(page.markdown(loaded))
+    click.echo(paths[0].read_text(encoding="utf-8"))
     for path in paths:
         click.echo(f"wrote {path}")
 

@@ -2,36 +2,30 @@
 
 from icrl4aht_data.commands.verbs import Verb
 
-_CLI, _MODELS, _LAB, _PLAY = (
-    f"icrl4aht_baselines.commands.{name}_commands" for name in ("train", "model", "experiment", "play")
-)
 _TRAIN, _CHECKS = "Train and evaluate", "Reference models and checks"
 
+
+def _verb(module: str, name: str, section: str, help: str) -> Verb:
+    """Return a command whose function has the last word of the command's name, such as `best_response_command`."""
+    function = name.split()[-1].replace("-", "_")
+    return Verb(name, f"icrl4aht_baselines.commands.{module}_commands:{function}_command", section, help)
+
+
 VERBS = (
-    Verb("demo", f"{_CLI}:demo_command", _TRAIN, "Demonstrate every step on the bundled release."),
-    Verb("train", f"{_CLI}:train_command", _TRAIN, "Train a model on learning histories."),
-    Verb("evaluate", f"{_CLI}:evaluate_command", _TRAIN, "Evaluate an agent on test tasks, or on validation tasks."),
-    Verb("report", f"{_CLI}:report_command", _TRAIN, "Compare results with the paper's."),
-    Verb("results", f"{_MODELS}:results_command", _TRAIN, "Compare models on the benchmark's tasks."),
-    Verb("submit", f"{_MODELS}:submit_command", _TRAIN, "Make a file of results for the page of `results`."),
-    Verb("models", f"{_MODELS}:models_command", _TRAIN, "List the bundled models."),
-    Verb("watch", f"{_CLI}:watch_command", _TRAIN, "Play an episode and draw it as a GIF."),
-    Verb("play", f"{_PLAY}:play_command", _TRAIN, "Play on a web page with a policy or a person."),
-    Verb("collect", f"{_MODELS}:collect_command", _TRAIN, "Record histories of an agent with a release's teammates."),
-    Verb("best-response", f"{_LAB}:best_response_command", _TRAIN, "Train a best response to each teammate."),
-    Verb(
-        "adaptation-headroom",
-        f"{_LAB}:adaptation_headroom_command",
-        _TRAIN,
-        "Estimate what memory across episodes can earn.",
-    ),
-    Verb("control", f"{_LAB}:control_command", _TRAIN, "Check that AD and DPT adapt in context."),
-    Verb(
-        "research reference",
-        f"{_MODELS}:reference_command",
-        _CHECKS,
-        "Make reference models, and the data that they are trained on.",
-    ),
-    Verb("research proof", f"{_LAB}:proof_command", _CHECKS, "Show what a release teaches."),
-    Verb("research headroom", f"{_LAB}:headroom_command", _CHECKS, "Measure the reference egos on every test task."),
+    _verb("train", "demo", _TRAIN, "Demonstrate every step on the bundled release."),
+    _verb("train", "train", _TRAIN, "Train a model on learning histories."),
+    _verb("train", "evaluate", _TRAIN, "Evaluate an agent on test tasks, or on validation tasks."),
+    _verb("train", "report", _TRAIN, "Compare results with the paper's."),
+    _verb("model", "results", _TRAIN, "Compare models on the benchmark's tasks."),
+    _verb("model", "submit", _TRAIN, "Make a file of results for the page of `results`."),
+    _verb("model", "models", _TRAIN, "List the bundled models."),
+    _verb("train", "watch", _TRAIN, "Play an episode and draw it as a GIF."),
+    _verb("play", "play", _TRAIN, "Play on a web page with a policy or a person."),
+    _verb("model", "collect", _TRAIN, "Record histories of an agent with a release's teammates."),
+    _verb("experiment", "best-response", _TRAIN, "Train a best response to each teammate."),
+    _verb("experiment", "adaptation-headroom", _TRAIN, "Estimate what memory across episodes can earn."),
+    _verb("experiment", "control", _TRAIN, "Check that AD and DPT adapt in context."),
+    _verb("model", "research reference", _CHECKS, "Make reference models, and the data that they are trained on."),
+    _verb("experiment", "research proof", _CHECKS, "Show what a release teaches."),
+    _verb("experiment", "research headroom", _CHECKS, "Measure the reference egos on every test task."),
 )

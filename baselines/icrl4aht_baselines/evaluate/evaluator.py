@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -122,16 +121,13 @@ def evaluate(
     missing = [plan for plan in planned if plan.task.task_id not in results]
     programs = Programs() if programs is None else programs
     evaluation = _Evaluation(make_ego, rules, control, seeds, suite, settings, programs)
-    with ExitStack() as stack:
-        if played is None:
-            show = stack.enter_context(progress_bars(unit="episodes"))
-            played = counted(show, f"{agent}, {rules.name}", len(tasks) * len(seeds) * rules.episodes)
+    with progress_bars(quiet=played is not None, unit="episodes") as show:
+        played = played or counted(show, f"{agent}, {rules.name}", len(tasks) * len(seeds) * rules.episodes)
         played(len(results) * len(seeds) * rules.episodes)
-        for found in evaluation.play(missing, played):
-            for result in found:
-                results[result.task_id] = result
-                if out is not None:
-                    write_result(out, result)
+        for result in evaluation.play(missing, played):
+            results[result.task_id] = result
+            if out is not None:
+                write_result(out, result)
     return [results[task.task_id] for task in tasks]
 
 
@@ -156,7 +152,7 @@ class _Evaluation:
     settings: dict[str, Any]
     programs: Programs
 
-    def play(self, planned: Sequence[PlannedTask], played: Callable[[int], None]) -> Iterator[list[Result]]:
+    def play(self, planned: Sequence[PlannedTask], played: Callable[[int], None]) -> Iterator[Result]:
         """Yield the results of each group of tasks that share compiled programs, as soon as the group is finished."""
         layouts = dict.fromkeys(task.layout for plan in planned for task in plan.played)
         egos = {layout: self.make_ego(layout) for layout in layouts}
@@ -164,17 +160,14 @@ class _Evaluation:
         for plan in planned:
             groups[tuple(_program_key(task, egos[task.layout], self.make_ego) for task in plan.played)].append(plan)
         stopped, make = Event(), self.make_ego if self.make_ego in SCRIPTED else egos.__getitem__
-
-        def run(group: list[PlannedTask]) -> list[Result]:
-            return self._play_group(group, make, stopped, played)
-
         # Groups run in parallel: one compiles while another plays, and a single group does not use all cores. An ego
         # outside JAX needs a single thread, because the episodes of a group must directly follow its `reset`.
         outside = any(isinstance(ego, HostPolicy) for ego in egos.values())
         with ThreadPoolExecutor(1 if outside else min(4, usable_cores())) as pool:
             try:
-                for future in as_completed([pool.submit(run, group) for group in groups.values()]):
-                    yield future.result()
+                futures = [pool.submit(self._play_group, group, make, stopped, played) for group in groups.values()]
+                for future in as_completed(futures):
+                    yield from future.result()
             finally:
                 stopped.set()
                 pool.shutdown(cancel_futures=True)

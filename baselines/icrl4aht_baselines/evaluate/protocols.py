@@ -7,7 +7,6 @@ episodes of a control differ from those of the evaluation without it only in the
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple
@@ -16,8 +15,9 @@ from icrl4aht_generation.policy import Noise
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks, teammate_id
-from icrl4aht_data.errors import EmptySelectionError, OptionError, unknown
+from icrl4aht_data.errors import EmptySelectionError, OptionError, check_choice
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.groups import grouped
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,7 @@ class Protocol:
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol's fields as stored with results; `swap_every` is left out if the teammate never changes."""
-        fields = asdict(self)
-        return fields if self.swap_every else {name: fields[name] for name in fields if name != "swap_every"}
+        return {name: value for name, value in asdict(self).items() if name != "swap_every" or value}
 
     @property
     def last_episodes(self) -> int:
@@ -98,8 +97,7 @@ def bundled_tasks(track: str, split: str) -> list[Task]:
     Raises:
         UnknownNameError: for an unknown track or split.
     """
-    if split not in EVALUATION_SPLITS:
-        raise unknown("split to evaluate on", split, EVALUATION_SPLITS)
+    check_choice("split to evaluate on", split, EVALUATION_SPLITS)
     diverse = split == "diverse"
     return read_tasks(manifest_path(track, "validation", "diverse") if diverse else manifest_path(track, split))
 
@@ -120,8 +118,7 @@ def get_protocol(name: str, episodes: int | None = None) -> Protocol:
         UnknownNameError: if the name is unknown; the message lists the valid names.
         OptionError: if the number of episodes is not positive.
     """
-    if name not in PROTOCOLS:
-        raise unknown("protocol", name, PROTOCOLS)
+    check_choice("protocol", name, PROTOCOLS)
     if episodes is None:
         return PROTOCOLS[name]
     if episodes < 1:
@@ -151,18 +148,11 @@ def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
     Raises:
         OptionError: if `count` is not positive.
     """
-    if count is None:
-        return list(tasks)
-    if count < 1:
+    if count is not None and count < 1:
         raise OptionError(f"tasks = {count}: expected at least 1 task of each family and layout")
-    taken: dict[tuple[str, str], int] = defaultdict(int)
-    chosen = []
-    for task in tasks:
-        group = task.layout.name, task.teammate_kind
-        if taken[group] < count:
-            chosen.append(task)
-        taken[group] += 1
-    return chosen
+    groups = grouped(tasks, lambda task: (task.layout.name, task.teammate_kind))
+    chosen = {task.task_id for group in groups.values() for task in group[:count]}
+    return [task for task in tasks if task.task_id in chosen]
 
 
 Control = Literal["cleared", "swapped"]
@@ -221,9 +211,7 @@ def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | Non
     segments = len(segment_lengths(protocol, control))
     if segments == 1:
         return [PlannedTask(task, (task,)) for task in tasks]
-    by_layout: dict[str, list[Task]] = defaultdict(list)
-    for task in tasks:
-        by_layout[task.layout.name].append(task)
+    by_layout = grouped(tasks, lambda task: task.layout.name)
     partner = {task.task_id: _swap_partner(task, by_layout[task.layout.name]) for task in tasks}
     planned = []
     for task in tasks:

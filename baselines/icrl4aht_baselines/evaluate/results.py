@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from icrl4aht_baselines.training.run_folder import check_same_settings
@@ -35,7 +34,7 @@ class Result:
     def to_json(self) -> dict[str, Any]:
         """Return the content of the result's JSON file, without `partners` if the list is empty."""
         content = {"settings_hash": json_hash(self.settings), **asdict(self)}
-        return content if self.partners else {name: content[name] for name in content if name != "partners"}
+        return {name: value for name, value in content.items() if name != "partners" or value}
 
 
 RESULTS = "tasks"
@@ -48,10 +47,7 @@ def result_path(out: Path, task_id: str) -> Path:
 
 
 def find_results(
-    out: Path,
-    tasks: Iterable[Task],
-    settings: dict[str, Any],
-    partners: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    out: Path, tasks: Iterable[Task], settings: dict[str, Any], partners: Mapping[str, Sequence[str]]
 ) -> dict[str, Result]:
     """Return task id -> stored result, for those tasks that a folder of results has.
 
@@ -59,7 +55,7 @@ def find_results(
         out: folder of results.
         tasks: tasks to find results of.
         settings: settings that the results must have.
-        partners: task id -> `Result.partners` that its result must have; empty by default.
+        partners: task id -> `Result.partners` that its result must have.
 
     Raises:
         OptionError: if a result has other settings or partners, a file is damaged, or the folder has other files and no
@@ -70,7 +66,7 @@ def find_results(
     paths = [result_path(out, task.task_id) for task in tasks]
     found = {result.task_id: result for result in map(read_result, filter(Path.exists, paths))}
     for result in found.values():
-        path, expected = result_path(out, result.task_id), list(partners.get(result.task_id, ()))
+        path, expected = result_path(out, result.task_id), [*partners[result.task_id]]
         check_same_settings(result.settings, settings, f"{path}: holds a result")
         if result.partners != expected:
             raise OptionError(

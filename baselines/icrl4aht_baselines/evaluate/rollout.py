@@ -229,13 +229,8 @@ class Programs:
 
 
 def _compile(rollout: EvaluationRollout, arguments: tuple[Any, Any, RolloutState]) -> EpisodeProgram:
-    _check_actions(rollout, arguments[-1])
-    episode = jax.jit(rollout.episode)
-    return episode if isinstance(rollout.ego, HostPolicy) else episode.lower(*arguments).compile()
-
-
-def _check_actions(rollout: EvaluationRollout, state: RolloutState) -> None:
-    """Check shape and dtype of the egos' actions by tracing one step, which computes nothing."""
+    """Compile an episode after checking the egos' actions by tracing one step, which computes nothing."""
+    state = arguments[-1]
     keys = state.env.key
     actions, _ = jax.eval_shape(rollout.ego_actions, rollout.ego.params, state, keys)
     if actions.shape != keys.shape or not jnp.issubdtype(actions.dtype, jnp.integer):
@@ -243,3 +238,5 @@ def _check_actions(rollout: EvaluationRollout, state: RolloutState) -> None:
             f"the ego's actions are {actions.dtype} of shape {actions.shape} for {keys.shape[0]} observations, "
             f"expected one integer 0..5 for each"
         )
+    episode = jax.jit(rollout.episode)
+    return episode if isinstance(rollout.ego, HostPolicy) else episode.lower(*arguments).compile()

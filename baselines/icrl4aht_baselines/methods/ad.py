@@ -66,7 +66,7 @@ class StepModel(nn.Module):
     """
 
     tokens: StepTokens
-    trunk: nn.Module
+    trunk: Any
     head: nn.Module
     next_obs: nn.Module | None = None
 
@@ -74,28 +74,25 @@ class StepModel(nn.Module):
         self, steps: StepInput, actions: Int[Array, "B L"] | None = None, deterministic: bool = True
     ) -> StepOutput:
         """Return the output for windows of steps, with predicted observations if actions are given."""
-        trunk: Any = self.trunk
         tokens_BxLxD = self.tokens(steps, deterministic)
-        features_BxLxD = trunk(tokens_BxLxD, deterministic=deterministic)
+        features_BxLxD = self.trunk(tokens_BxLxD, deterministic=deterministic)
         predicted = None if self.next_obs is None or actions is None else self.next_obs(features_BxLxD, actions)
         return StepOutput(self.head(features_BxLxD), predicted)
 
     def start(self, context: int, cached: bool) -> Any:
         """Return the memory of an ego before its first step."""
-        trunk: Any = self.trunk
-        states = trunk.start(context) if cached else None
+        states = self.trunk.start(context) if cached else None
         return WindowMemory(jnp.zeros((context, self.tokens.width)), jnp.int32(0), states)
 
     def act(self, step: StepInput, done: Bool[Array, ""], memory: WindowMemory) -> tuple[Any, WindowMemory]:
         """Return the head's output for one step of an acting ego, and the memory that includes this step."""
-        trunk: Any = self.trunk
         tokens, steps, states = self._drop_if_full(memory)
         token = self.tokens(step)
         tokens = tokens.at[steps].set(token)
         if states is None:
-            feature = trunk(tokens[None])[0, steps]
+            feature = self.trunk(tokens[None])[0, steps]
         else:
-            feature, states = trunk.advance(token, states)
+            feature, states = self.trunk.advance(token, states)
         return self.head(feature), WindowMemory(tokens, steps + 1, states)
 
     def _drop_if_full(self, memory: WindowMemory) -> WindowMemory:

@@ -64,10 +64,6 @@ class ViewChange(NamedTuple):
         """Convert actions from the environment to the ego's view, or from the ego's view to the environment."""
         return jnp.asarray(_MIRRORED_ACTIONS, actions.dtype)[self.upside_down + 2 * self.sideways, actions]
 
-    def repeat_for_steps(self, steps: int, axis: int) -> ViewChange:
-        """Return the changes repeated along a new axis of steps."""
-        return ViewChange(*(jnp.repeat(jnp.expand_dims(flag, axis), steps, axis) for flag in self))
-
 
 def _exchange_directions(obs: Array, one: str, other: str) -> Array:
     """Return observations in which two directions that agents may face are exchanged.
@@ -82,16 +78,6 @@ def _exchange_directions(obs: Array, one: str, other: str) -> Array:
     source = [CANONICAL_CHANNELS.index(exchanged.get(name, name)) for name in CANONICAL_CHANNELS]
     runs = np.split(source, np.flatnonzero(np.diff(source) != 1) + 1)
     return jnp.concatenate([obs[..., run[0] : run[-1] + 1] for run in runs], axis=-1)
-
-
-def mirrored_action(actions: np.ndarray, mirroring: np.ndarray) -> np.ndarray:
-    """Return the actions of batch rows as seen in the mirrored view.
-
-    Args:
-        actions: int (B, ..).
-        mirroring: int (B,), number of each row's mirroring, see `changed_view`.
-    """
-    return _MIRRORED_ACTIONS.astype(actions.dtype)[mirroring.reshape(-1, *(1,) * (actions.ndim - 1)), actions]
 
 
 def no_change(*shape: int) -> ViewChange:
@@ -154,7 +140,7 @@ class NumberedBatches:
         drawn = np.random.default_rng((self._sampler.seed, i, self._sampler.process_index))
         mirroring = drawn.integers(4, size=rows, dtype=np.int32)
         actions = {
-            name: mirrored_action(values, mirroring)
+            name: _MIRRORED_ACTIONS.astype(values.dtype)[mirroring.reshape(-1, *(1,) * (values.ndim - 1)), values]
             for name, values in batch._asdict().items()
             if values is not None and (name.endswith("actions") or name == "query_target")
         }

@@ -19,9 +19,9 @@ from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.teammates.registry import build_teammate, with_equal_parameters
 from scipy import stats
 
-from icrl4aht_baselines.online.responses import ResponseOptions, TrainingJob
+from icrl4aht_baselines.online.responses import EgoJob
 from icrl4aht_baselines.online.rl2 import TaskGroup
-from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_baselines.training.options import ResponseOptions
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
@@ -37,7 +37,7 @@ _MEASURE_SEED = 1_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeadroomJob(TrainingJob):
+class HeadroomJob(EgoJob):
     """Job that trains an informed or episodic ego on a set of tasks, and measures its returns.
 
     Attributes:
@@ -74,26 +74,17 @@ class HeadroomJob(TrainingJob):
         tasks = json_hash([task.task_id for task in self.tasks])
         return {"tasks_hash": tasks, "kind": self.kind, **super().settings}
 
-    def returns(self) -> dict[str, float]:
-        """Return task id -> mean return of the trained ego, from the result of a finished job."""
-        return self.result()["returns"]
-
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
-        """Train the ego, and measure its mean return in each task with sampled actions in new episodes."""
-        groups, numbers = self._task_groups()
-        layouts = list(dict.fromkeys(task.layout for task in self.tasks))
-        told = len(self.tasks) if self.kind == "informed" else 0
-        trainer, params = self.train(layouts, groups, on_update, told=told)
-        by_task: dict[int, list[float]] = defaultdict(list)
-        groups_played = [group for player in trainer.players for group in player.groups]
-        measured = trainer.measure(params, MEASURED_EPISODES, _MEASURE_SEED)
-        for group, returns in zip(groups_played, measured, strict=True):
-            for number, own in zip(numbers[group.name], returns.mean(axis=1), strict=True):
-                by_task[number].append(float(own))
-        return {"returns": {task.task_id: round(float(np.mean(by_task[k])), 3) for k, task in enumerate(self.tasks)}}
+        """Train the ego. Return the `returns`: task id -> mean return with sampled actions in new episodes."""
+        trainer, params = self.train(self._task_groups(), on_update)
+        by_task: dict[str, list[float]] = defaultdict(list)
+        for group, returns in trainer.measure(params, MEASURED_EPISODES, _MEASURE_SEED).items():
+            for task_id, own in zip(group.ids, returns.mean(axis=1), strict=True):
+                by_task[task_id].append(float(own))
+        return {"returns": {one.task_id: round(float(np.mean(by_task[one.task_id])), 3) for one in self.tasks}}
 
-    def _task_groups(self) -> tuple[list[TaskGroup], dict[str, list[int]]]:
-        """Return the groups of tasks that are played in parallel, and group name -> numbers of the group's tasks."""
+    def _task_groups(self) -> list[TaskGroup]:
+        """Return the groups of tasks that are played in parallel, one for each kind of teammate."""
         numbers: dict[str, list[int]] = defaultdict(list)
         for played in range(self.options.tasks):
             number = played % len(self.tasks)
@@ -104,9 +95,9 @@ class HeadroomJob(TrainingJob):
             several = len(set(layouts)) > 1
             entries = with_equal_parameters([self.tasks[number].teammate for number in own])
             mates = [build_teammate(None if several else layouts[0], entry) for entry in entries]
-            told = own if self.kind == "informed" else None
-            groups.append(TaskGroup(layouts, kind, mates, False, self.title, told))
-        return groups, {group.name: own for group, own in zip(groups, numbers.values(), strict=True)}
+            told, ids = own if self.kind == "informed" else None, [self.tasks[number].task_id for number in own]
+            groups.append(TaskGroup(layouts, kind, mates, False, self.title, told, ids))
+        return groups
 
 
 def headroom_jobs(
@@ -131,7 +122,7 @@ def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | 
     seeds = sorted(set.intersection(*({job.seed for job in own if job.kind == kind} for kind in EGO_KINDS)))
     if not seeds:
         return None
-    found = {(job.kind, job.seed): job.returns() for job in own}
+    found = {(job.kind, job.seed): job.result()["returns"] for job in own}
     layouts = dict.fromkeys(task.layout.name for task in own[0].tasks)
 
     def mean(kind: str, seeds: Sequence[int], layout: str = "") -> float:
@@ -141,7 +132,7 @@ def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | 
     return {
         "tasks": title,
         "number": len(own[0].tasks),
-        "steps": own[0].options.updates * own[0].options.tasks * KEPT_STEPS,
+        "steps": own[0].options.updates * own[0].options.steps_per_update,
         "width": own[0].options.width,
         "returns": {kind: {str(seed): mean(kind, [seed]) for seed in seeds} for kind in EGO_KINDS},
         "layouts": {layout: {kind: mean(kind, seeds, layout) for kind in EGO_KINDS} for layout in layouts},

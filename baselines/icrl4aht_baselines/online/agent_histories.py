@@ -36,7 +36,7 @@ from icrl4aht_baselines.agents.egos import NamedEgo
 from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import get_protocol, segment_lengths
 from icrl4aht_baselines.evaluate.rollout import Programs
-from icrl4aht_baselines.online.teammates import check_heuristics
+from icrl4aht_baselines.online.teammates import tasks_on_layouts
 from icrl4aht_baselines.training.run_folder import check_same_settings
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks, teammate_id
@@ -260,16 +260,9 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
             f"{dataset.root}: {TASKS} does not describe {len(missing)} of {len(wanted)} tasks, such as "
             f"{min(missing)}: choose a release that was made with its tasks"
         )
-    check_heuristics(tasks)
-    layouts = {layout.name for layout in dataset.layouts}
-    if tasks and not any(task.layout.name in layouts for task in tasks):
-        raise OptionError(
-            f"none of the {len(tasks)} tasks of the manifests is on {', '.join(sorted(layouts))}; leave them out, or "
-            f"choose other layouts"
-        )
     found: dict[tuple[str, str], Task] = {}
     references = {}
-    for task in known + [task for task in tasks if task.layout.name in layouts]:
+    for task in known + tasks_on_layouts(tasks, dataset.layouts):
         if task.teammate_key in found:
             continue
         seed = FIRST_SEED + number * _SEEDS + len(found)
@@ -342,26 +335,17 @@ def collect_release(
         groups[task.layout.name, task.teammate_kind].append(task)
     total = len(teammates.tasks) * config.histories * config.episodes
     show, label = counted(progress, f"{agent.name}: episodes", total), labeller and labeller.make
+    by = f"{agent.name}, before the noise" if labeller is None else f"{labeller.name}, in histories of {agent.name}"
+    new = []
     for (layout, kind), tasks in groups.items():
         folder = parts / f"{layout}-{kind}"
         if folder.is_dir():
             show(len(tasks) * config.histories * config.episodes)
         else:
             _save_part(folder, record_histories(agent.make, tasks, config, teammates.suite, show, label, swaps))
-    by = f"{agent.name}, before the noise" if labeller is None else f"{labeller.name}, in histories of {agent.name}"
-    new = [
-        _agent_task(
-            task,
-            number,
-            parts / f"{layout}-{kind}",
-            ExpertLabels(policy_sha256=None, action=by, view=views[task.layout]),
-            config,
-            teammates,
-            swaps.get(task.task_id),
-        )
-        for (layout, kind), tasks in groups.items()
-        for number, task in enumerate(tasks)
-    ]
+        for number, task in enumerate(tasks):
+            labels = ExpertLabels(policy_sha256=None, action=by, view=views[task.layout])
+            new.append(_agent_task(task, number, folder, labels, config, teammates, swaps.get(task.task_id)))
     write_release(out, "lite", new, data_version="1.0.0", overwrite=overwrite, sources=[teammates.root])
     shutil.rmtree(parts)
     return out

@@ -16,7 +16,7 @@ from icrl4aht_generation.teammates.spread import find_measured
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup, make_group, make_groups
-from icrl4aht_baselines.online.teammates import check_heuristics
+from icrl4aht_baselines.online.teammates import tasks_on_layouts
 from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cell, training_cells
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import TASKS_SOURCE
@@ -68,7 +68,7 @@ def prepare_play(
     """
     _check_unused(name, histories)
     release, dataset, layouts = _chosen_histories(histories, tasks)
-    tasks = _tasks_on_layouts(layouts, tasks)
+    tasks = tasks_on_layouts(tasks, layouts)
     teammates = _task_teammates(dataset, tasks)
     _check_layouts(layouts, teammates)
     # Channels are canonical, because one network plays on all layouts.
@@ -121,17 +121,6 @@ def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple
             return release, None, layouts
     dataset = filter_histories(release.filter(split="train", layout=names), histories.filters)
     return release, dataset, layouts or list(dataset.layouts)
-
-
-def _tasks_on_layouts(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
-    """Return those of the tasks that are on one of the layouts."""
-    check_heuristics(tasks)  # a manifest has no checkpoints of learned teammates
-    names = {layout.name for layout in layouts}
-    found = [task for task in tasks if task.layout.name in names]
-    if tasks and not found:
-        on = ", ".join(sorted({task.layout.name for task in tasks}))
-        raise OptionError(f"expected tasks on {', '.join(one.name for one in layouts)}, found {len(tasks)} on {on}")
-    return found
 
 
 def _task_teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
@@ -253,16 +242,14 @@ def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
     The value is 1 if the oracle earns more than `stay` with at least one of the layout's teammates, according to stored
     measurements, or if a teammate was not measured.
     """
-    matters: dict[str, bool] = {}
+    matters: dict[str, bool] = defaultdict(bool)
     for task in tasks:
         draw = find_measured(task.layout.name, task.teammate)
-        own = draw is None or draw.oracle - draw.stay >= LEAST_HEADROOM
-        matters[task.layout.name] = matters.get(task.layout.name, False) or own
+        matters[task.layout.name] |= draw is None or draw.oracle - draw.stay >= LEAST_HEADROOM
     if dataset is not None:
         for layout, task_id in zip(dataset.column("layout"), dataset.column("task_id"), strict=True):
             made = dataset.provenance.get(str(task_id))
-            own = made is None or made.references is None or made.references.egos_differ
-            matters[str(layout)] = matters.get(str(layout), False) or own
+            matters[str(layout)] |= made is None or made.references is None or made.references.egos_differ
     return {layout: 1.0 if found else FLAT_SHARE for layout, found in matters.items()}
 
 

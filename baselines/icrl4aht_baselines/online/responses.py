@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
-from icrl4aht_generation.learners.resume import METRICS, TIMING, differing_settings, last_line, run_lock
+from icrl4aht_generation.learners.resume import METRICS
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.distances import act_on_records, common_states, group_behaviours
 from icrl4aht_generation.teammates.registry import build_teammate
@@ -31,6 +31,7 @@ from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup
 from icrl4aht_baselines.training.histories import read_trained
+from icrl4aht_baselines.training.job import TrainingJob
 from icrl4aht_baselines.training.options import PlayOptions, ResponseOptions
 from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_data.benchmark.best_responses import (
@@ -45,8 +46,7 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS, LAYOUT_NAMES, LEAST_HEADRO
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import unknown
-from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import json_hash, parse_json, read_text
 from icrl4aht_data.utils.templates import markdown_table
 
 PROTOCOL = "seeded"
@@ -57,9 +57,6 @@ CHOICE_SEEDS, REPORT_SEEDS = (1000,), (0, 1, 2)
 
 RESPONSES_FILE = "best_responses.json"
 """Name of the file of best responses, in a folder of training runs and among the package's cards."""
-
-RESULT = "result.json"
-"""Name of the file with the result of a training run, in the folder of its job."""
 
 ABOUT = (
     "Best responses: recurrent PPO with the benchmark's 5 x 5 view, trained with one teammate alone, memory cleared "
@@ -114,28 +111,18 @@ def with_headroom(tasks: Iterable[Task]) -> list[Task]:
 
 
 @dataclass(frozen=True)
-class TrainingJob:
-    """Job that trains an ego by playing and measures it, see `icrl4aht_generation.jobs.job.Job`.
+class EgoJob(TrainingJob):
+    """Job that trains an ego by playing and measures it.
 
     Attributes:
         tasks: the tasks that the ego plays.
-        seed: seed of the training run.
-        options: settings of the training run.
-        out: folder of all jobs.
-        xla_threads: number of XLA threads on a CPU.
+        seed, options, out: see `TrainingJob`.
     """
 
     tasks: tuple[Task, ...]
     seed: int
     options: ResponseOptions
     out: Path
-    xla_threads: int | None = 1
-    is_quick: bool = False
-
-    @property
-    def name(self) -> str:
-        """Unique name of the job in its queue, which is also the name of its folder."""
-        raise NotImplementedError
 
     @property
     def name_suffix(self) -> str:
@@ -160,81 +147,26 @@ class TrainingJob:
             "code_version": version("icrl4aht-data"),
         }
 
-    @property
-    def folder(self) -> Path:
-        """Folder of the training run and of its result."""
-        return self.out / self.name
-
-    @property
-    def updates(self) -> int:
-        """Number of training updates."""
-        return self.options.updates
-
-    def is_finished(self) -> bool:
-        """Return whether a result with the settings of this job is stored."""
-        path = self.folder / RESULT
-        return path.is_file() and not differing_settings(self.result()["settings"], self.settings)
-
-    def result(self) -> dict[str, Any]:
-        """Return the content of result.json: `settings`, and the values that `measure` returned."""
-        return parse_json(read_text(self.folder / RESULT))
-
-    def progress(self) -> tuple[int, float] | None:
-        """Return the finished training steps and the environment steps per second; None before the first log line."""
-        timing = last_line(self.folder / "run" / TIMING)
-        if timing is None:
-            return None
-        return timing["step"], timing["steps_per_second"] * self.options.tasks * KEPT_STEPS
-
-    def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
-        """Train the ego, measure it, and write result.json."""
-        with run_lock(self.folder, wait=wait):
-            if self.is_finished():
-                return
-            content = {"settings": self.settings, **self.measure(on_update)}
-            with atomic_write(self.folder / RESULT) as partial:
-                write_json(partial, content)
-
-    def finished_text(self) -> str:
-        """Return a note on the result for progress displays."""
-        return "finished"
-
-    def measure(self, on_update: OnUpdate) -> dict[str, Any]:
-        """Train the ego, and return the measured values, as JSON."""
-        raise NotImplementedError
-
-    def train(
-        self,
-        layouts: Sequence[Layout],
-        groups: Sequence[TaskGroup],
-        on_update: OnUpdate,
-        params: Any = None,
-        told: int = 0,
-    ) -> tuple[PlayTrainer, Any]:
+    def train(self, groups: Sequence[TaskGroup], on_update: OnUpdate, params: Any = None) -> tuple[PlayTrainer, Any]:
         """Train an ego on groups of tasks, or resume a stopped run. Return the trainer and the parameters.
 
         Args:
-            layouts: layouts of the tasks.
-            groups: groups of tasks.
+            groups: groups of tasks; with `partners`, the ego observes the task's number in every step.
             on_update: function for progress, see `run`.
             params: initial parameters; by default random ones that depend on the seed.
-            told: number of tasks, for an informed ego, which observes the task's number in every step; otherwise 0.
         """
-        model = self.model
-        method = get_method("rl2")(model, overcooked_world(layouts, model.encoder, canonical=True, partners=told))
-        options = self.options.training(self.seed)
-        trainer = PlayTrainer(method, options, PLAY, groups)
-
-        def done(step: int, loss: float | None) -> None:
-            on_update(step, (self.progress() or (0, 0.0))[1])
-
-        task = TrainingTask(method, TrainingData(None, {}), options, self.settings, trainer)
-        state = task.train(self.folder / "run", params=params, done=done)
+        layouts = list(dict.fromkeys(task.layout for task in self.tasks))
+        told = 0 if groups[0].partners is None else len(self.tasks)
+        world = overcooked_world(layouts, self.model.encoder, canonical=True, partners=told)
+        method = get_method("rl2")(self.model, world)
+        trainer = PlayTrainer(method, self.training, PLAY, groups)
+        task = TrainingTask(method, TrainingData(None, {}), self.training, self.settings, trainer)
+        state = task.train(self.run_folder, params=params, done=self.step_progress(on_update))
         return trainer, state.params
 
 
 @dataclass(frozen=True)
-class ResponseJob(TrainingJob):
+class ResponseJob(EgoJob):
     """Job that trains and evaluates one best response, on a group of tasks from `find_behaviours`.
 
     The best response is trained with the teammate of the group's first task.
@@ -278,13 +210,13 @@ class ResponseJob(TrainingJob):
             params = read_trained(models[self.options.init].runs[track_of(task.layout.name)]).params
         mates = [build_teammate(task.layout, task.teammate)] * self.options.tasks
         group = TaskGroup([task.layout] * len(mates), task.teammate_kind, mates, False, task.layout.name)
-        trainer, params = self.train([task.layout], [group], on_update, params)
+        trainer, params = self.train([group], on_update, params)
         modes = {}
         for mode, greedy in (("greedy", True), ("sampled", False)):
             policy = with_view(trained_policy(trainer.method, params, KEPT_STEPS, PlayMode(greedy=greedy)), "canonical")
             choice, report = (self._mean_return(policy, seeds) for seeds in (CHOICE_SEEDS, REPORT_SEEDS))
             modes[mode] = {"choice": choice, "return": report}
-        lines = map(parse_json, read_text(self.folder / "run" / METRICS).splitlines())
+        lines = map(parse_json, read_text(self.run_folder / METRICS).splitlines())
         returns = [value for line in lines for name, value in line.items() if name.startswith("return ")]
         last, before = returns[len(returns) * 3 // 4 :], returns[len(returns) // 2 : len(returns) * 3 // 4]
         slope = float(np.mean(last) - np.mean(before)) if len(before) else 0.0
@@ -301,10 +233,9 @@ def trained_response(job: ResponseJob) -> TrainedResponse:
     """Return the record of a finished training run, for the play mode that earns more on the episodes to choose by."""
     result = job.result()
     acting, earned = max(result["modes"].items(), key=lambda mode: mode[1]["choice"])
-    steps = job.options.updates * job.options.tasks * KEPT_STEPS
     return TrainedResponse(
         seed=job.seed,
-        steps=steps,
+        steps=job.options.updates * job.options.steps_per_update,
         width=job.options.width,
         mean_return=earned["return"],
         choice=earned["choice"],

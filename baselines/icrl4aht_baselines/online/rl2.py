@@ -117,7 +117,7 @@ def make_groups(
     """Return groups of tasks: divided among layouts by their shares, and equally among a layout's kinds of teammates.
 
     Args:
-        teammates: (layout, kind of teammate) -> task id -> teammate; see `chosen_teammates` for the choice among them.
+        teammates: (layout, kind of teammate) -> task id -> teammate; see `make_group` for the choice among them.
         tasks: approximate total number of tasks; each group has at least one.
         shares: name of each layout -> relative number of its tasks.
         hidden: names of layouts whose recipe indicators the model does not see.
@@ -138,24 +138,19 @@ def make_group(
 ) -> TaskGroup:
     """Return a group of tasks on some layouts, with teammates that do not always follow their script.
 
+    Teammates have equal numbers of tasks, up to a difference of one. With fewer tasks than teammates, some teammates
+    have none.
+
     Args:
         layouts, family, hidden, label: see `TaskGroup`.
         teammates: task id -> teammate to choose from.
     """
-    names = list(teammates)
-    ids = [names[number] for number in chosen_teammates(len(names), len(layouts))]
-    mates = with_behaviours([teammates[task] for task in ids], mixed_chances(len(layouts)))
+    names, tasks = list(teammates), len(layouts)
+    numbers = np.arange(max(tasks, len(names))) % len(names)
+    # The order is shuffled, because a teammate's behaviours depend on the index of its task.
+    ids = [names[number] for number in np.random.default_rng(0).permutation(numbers)[:tasks]]
+    mates = with_behaviours([teammates[task] for task in ids], mixed_chances(tasks))
     return TaskGroup(layouts, family, mates, hidden, label, ids=ids)
-
-
-def chosen_teammates(teammates: int, tasks: int) -> np.ndarray:
-    """Return the index of each task's teammate in a group of tasks, int (tasks,).
-
-    Teammates have equal numbers of tasks, up to a difference of one. With fewer tasks than teammates, some teammates
-    have none. The order is shuffled, because a teammate's behaviours depend on the index of its task.
-    """
-    numbers = np.arange(max(tasks, teammates)) % teammates
-    return np.random.default_rng(0).permutation(numbers)[:tasks]
 
 
 class _Network(NamedTuple):
@@ -195,7 +190,6 @@ class _Player:
             np.array([number[layout] for layout in played]) if several else None,
         )
         self.mates = self.rollout.teammate_params
-        self.compiled: Any = jax.jit(self.episode)
 
     def start(self, key: Key[Array, ""]) -> RolloutState:
         """Return the state before the first episode of all tasks."""
@@ -243,16 +237,13 @@ class _Player:
         if self._changes:
             # Only the first step of an episode can be the first step of a task.
             started = jnp.ones((len(record) + 1, self.tasks), bool).at[0].set(state.ego.started)
-            seen = seen_steps(change.repeat_for_steps(len(record) + 1, 0), steps, started)
-        else:
-            seen = steps
+            steps = seen_steps(change, steps, started)
         # Log-probabilities and values are computed again with the operations of the loss, so that both agree exactly.
-        _, logits, value = _Network(self._method.model).apply(params, state.ego.state, seen)
-        own = change.repeat_for_steps(len(record), 0)
-        action = own.actions(taken)
+        _, logits, value = _Network(self._method.model).apply(params, state.ego.state, steps)
+        action = change.actions(taken)
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits[:-1]), action[..., None], axis=-1)[..., 0]
         return Sequences(
-            seen=jax.tree.map(lambda leaf: leaf[:-1], seen),
+            seen=jax.tree.map(lambda leaf: leaf[:-1], steps),
             reset=jnp.zeros(reward.shape, bool),  # the recurrent state is never reset within an episode
             action=action,
             log_prob=log_prob,
@@ -265,7 +256,7 @@ class _Player:
             weight=jnp.ones((1, self.tasks)),
             last_value=value[-1][None],
             # The oracle's actions are converted from the environment's view to the model's view.
-            expert=own.actions(follow_oracle(self.rollout.layout, record, taken, state.env.layout)),
+            expert=change.actions(follow_oracle(self.rollout.layout, record, taken, state.env.layout)),
         )
 
 
@@ -283,7 +274,7 @@ def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"])
     """Return steps as they look to an ego with changed observations.
 
     Args:
-        change: changes of the observations (*B,).
+        change: changes of the observations (*B,), or of their last axes if they are equal in all steps.
         steps: steps with the environment's observations (*B, ..).
         started: whether each step has a previous step in its task; if not, previous actions are fillers and stay 0.
     """
@@ -339,7 +330,6 @@ class PlayTrainer:
     ) -> None:
         self.method, self.options, self.play = method, options, play
         self.players = make_players(groups, method, play, mirror)
-        self._mates = [player.mates for player in self.players]
         self.tasks = sum(player.tasks for player in self.players)
         if self.tasks < play.minibatches:
             raise OptionError(
@@ -363,7 +353,7 @@ class PlayTrainer:
         )
         self.ppo = PPO(_Network(method.model), config)
         self._learn = jax.jit(self._learn_from, donate_argnums=(0, 1))
-        self._compiled: list[Any] | None = None
+        self._compiled: list[Callable[..., Any]] = []
 
     def init(self) -> PlayState:
         """Return the state before the first training step."""
@@ -393,15 +383,15 @@ class PlayTrainer:
         # Random keys depend on the seed and the step only, so that a resumed run plays the same episodes.
         play_key, learn_key = jax.random.split(jax.random.fold_in(jax.random.key(self.options.seed + 1), number))
         keys = jax.random.split(play_key, len(self.players))
-        if self._compiled is None:
-            self._compiled = self._compile(state, keys[0])
+        programs = self.programs(state.params, state.tasks)
         played = [
-            episode(state.params, mates, tasks, key)
-            for episode, mates, tasks, key in zip(self._compiled, self._mates, state.tasks, keys, strict=True)
+            episode(state.params, player.mates, tasks, key)
+            for episode, player, tasks, key in zip(programs, self.players, state.tasks, keys, strict=True)
         ]
         tasks, sequences, returns = zip(*played, strict=True)
         # Minibatches are sampled from all groups together, so that each one has many layouts.
-        weight = imitation_weight(self.play, state.step, self.options.steps)
+        falling = jnp.maximum(0.0, 1.0 - state.step / (self.play.imitation_end * self.options.steps))
+        weight = self.play.imitation * falling
         params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
         by_name: dict[str, list[Array]] = defaultdict(list)
         for player, own in zip(self.players, returns, strict=True):
@@ -410,32 +400,39 @@ class PlayTrainer:
         log |= {f"return {name}": jnp.concatenate(own).mean() for name, own in by_name.items()}
         return PlayState(params, optimizer, tasks, state.step + 1), log
 
-    def measure(self, params: Any, episodes: int, seed: int) -> list[np.ndarray]:
-        """Return the returns of sampled actions in new episodes: for each group an array float64 (tasks, episodes).
+    def measure(self, params: Any, episodes: int, seed: int) -> dict[TaskGroup, np.ndarray]:
+        """Return group -> returns of sampled actions in new episodes, float64 (tasks, episodes).
 
         Args:
             params: parameters of the model.
             episodes: number of episodes of each task.
             seed: seed of the episodes.
         """
-        found: list[np.ndarray] = []
-        for number, player in enumerate(self.players):
-            key = jax.random.fold_in(jax.random.key(seed), number)
-            state, returns = player.start(key), []
+        found: dict[TaskGroup, np.ndarray] = {}
+        keys = [jax.random.fold_in(jax.random.key(seed), number) for number in range(len(self.players))]
+        states = [jax.jit(player.start)(key) for player, key in zip(self.players, keys, strict=True)]
+        for player, key, state, episode in zip(self.players, keys, states, self.programs(params, states), strict=True):
+            returns = []
             for step in range(episodes):
-                state, _, own = player.compiled(params, player.mates, state, jax.random.fold_in(key, step + 1))
+                state, _, own = episode(params, player.mates, state, jax.random.fold_in(key, step + 1))
                 returns.append(np.asarray(own, np.float64))
-            found += np.split(np.stack(returns, axis=-1), player.ends)
+            found |= zip(player.groups, np.split(np.stack(returns, axis=-1), player.ends), strict=True)
         return found
 
-    def _compile(self, state: PlayState, key: Key[Array, ""]) -> list[Callable[..., Any]]:
-        """Compile the episodes of all players in parallel, since a compilation takes seconds and uses one core."""
-        with ThreadPoolExecutor() as pool:
+    def programs(self, params: Any, tasks: Sequence[RolloutState]) -> list[Callable[..., Any]]:
+        """Return the compiled episode of each player, for its running tasks.
+
+        All players are compiled at the first call, in parallel, since a compilation takes seconds and uses one core.
+        """
+        if not self._compiled:
+            key = jax.random.key(0)
             lowered = [
-                player.compiled.lower(state.params, mates, tasks, key)
-                for player, mates, tasks in zip(self.players, self._mates, state.tasks, strict=True)
+                jax.jit(player.episode).lower(params, player.mates, own, key)
+                for player, own in zip(self.players, tasks, strict=True)
             ]
-            return list(pool.map(lambda one: one.compile(), lowered))
+            with ThreadPoolExecutor() as pool:
+                self._compiled = list(pool.map(lambda one: one.compile(), lowered))
+        return self._compiled
 
     def _learn_from(
         self, params: Any, optimizer: Any, parts: tuple[Sequences, ...], key: Key[Array, ""], weight: Array
@@ -447,8 +444,3 @@ class PlayTrainer:
         total = log["policy_loss"] + config.value * log["value_loss"] - config.entropy * log["entropy"]
         total += weight * log["imitation_loss"]  # so that "loss" is the complete loss, as in the logs of other methods
         return params, optimizer, {"loss": total, **log, "imitation_weight": weight}
-
-
-def imitation_weight(play: PlayOptions, step: Int[Array, ""], steps: int) -> Float[Array, ""]:
-    """Return the weight of the imitation loss in a step of a run of `steps` steps, which falls linearly to 0."""
-    return play.imitation * jnp.maximum(0.0, 1.0 - step / (play.imitation_end * steps))

@@ -7,7 +7,7 @@ the episode.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -19,6 +19,7 @@ from icrl4aht_generation.policy import Policy, sometimes_random
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import STAY
+from icrl4aht_data.overcooked.layouts import Layout
 
 BEHAVIOURS = ("script", "stay", "random", "noisy")
 """Behaviours of a teammate, in the order of its probabilities."""
@@ -36,11 +37,11 @@ MIXTURE: tuple[tuple[float, tuple[float, ...]], ...] = (
 """Pairs of a share of the tasks and the probabilities of `BEHAVIOURS` of their teammates."""
 
 
-def check_heuristics(tasks: Iterable[Task]) -> None:
-    """Check that all tasks have heuristic teammates.
+def tasks_on_layouts(tasks: Sequence[Task], layouts: Sequence[Layout]) -> list[Task]:
+    """Return those tasks of a manifest that are on one of the layouts.
 
     Raises:
-        OptionError: if a task has a learned teammate; the message names the task.
+        OptionError: if a task has a learned teammate (the message names the task), or none of the tasks is on a layout.
     """
     for task in tasks:
         if task.teammate["kind"] != "heuristic":
@@ -48,6 +49,15 @@ def check_heuristics(tasks: Iterable[Task]) -> None:
                 f"task {task.task_id}: its teammate is learned; expected heuristics, which need no checkpoints: leave "
                 f"these tasks out of the manifest"
             )
+    names = {layout.name for layout in layouts}
+    found = [task for task in tasks if task.layout.name in names]
+    if tasks and not found:
+        on = ", ".join(sorted({task.layout.name for task in tasks}))
+        raise OptionError(
+            f"expected tasks on {', '.join(sorted(names))}, found {len(tasks)} on {on}: leave out the manifest, or "
+            f"choose other layouts"
+        )
+    return found
 
 
 def mixed_chances(tasks: int) -> np.ndarray:

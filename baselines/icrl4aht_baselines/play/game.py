@@ -37,8 +37,6 @@ from icrl4aht_data.overcooked.state import swap_agents
 HUMAN = "human"
 """Name of the partner if it is a second person."""
 
-_STREAMS = (EGO_STEPS, TEAMMATE_STEPS)
-
 
 class _SwappedLayout(Layout):
     """Layout with the start cells of its two agents exchanged, for an ego that plays agent 1."""
@@ -68,7 +66,7 @@ class PolicyPlayer:
 
     def begin(self, task_key: jax.Array, episode_key: jax.Array, episode: int) -> None:
         """Prepare for an episode. The memory is reset, except that an ego keeps it from one episode to the next."""
-        self._key = jax.random.fold_in(episode_key, _STREAMS[self.slot])
+        self._key = jax.random.fold_in(episode_key, (EGO_STEPS, TEAMMATE_STEPS)[self.slot])
         if episode == 0 or not self.is_ego:
             key = jax.random.fold_in(task_key if self.is_ego else episode_key, self.slot)
             self._memory = self.policy.init(self.policy.params, key)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
@@ -287,17 +288,13 @@ def open_port(port: int) -> socket.socket:
     Raises:
         OptionError: if the port is in use or not allowed.
     """
-    found = socket.socket()
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        found.bind((HOST, port))
-        found.listen()
+        return socket.create_server((HOST, port))
     except OSError as error:
-        found.close()
+        reason = os.strerror(error.errno or 0)
         raise OptionError(
-            f"port {port} of {HOST}: {error.strerror}; give another --port, or --port 0 for any free port"
+            f"port {port} of {HOST}: {reason}; give another --port, or --port 0 for any free port"
         ) from error
-    return found
 
 
 def serve_session(session: PlaySession, listener: socket.socket) -> None:

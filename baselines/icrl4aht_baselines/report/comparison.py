@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from icrl4aht_baselines.agents.egos import OTHER_WAYS
+from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.results import (
     EPISODE_BLOCKS,
@@ -20,6 +21,7 @@ from icrl4aht_baselines.report.results import (
     TEST_LAYOUTS,
     AgentReturns,
     ResultCell,
+    as_run,
     in_order,
     mean_of,
     returns_by_cell,
@@ -35,7 +37,7 @@ from icrl4aht_baselines.report.scores import (
     score_difference,
 )
 from icrl4aht_baselines.report.statistics import MeanInterval, holm
-from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission, submitted_runs
+from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission
 from icrl4aht_baselines.training.seen import overlap_legend, overlap_marks
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
@@ -144,7 +146,8 @@ def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
     """Return stored results plus submitted ones, which replace stored ones if `Submission.update` is set."""
     controls = {one.control for one in found.evaluations}
     tables, curves = [], defaultdict(list)
-    for one, run in submitted_runs(found):
+    for one in found.evaluations:
+        run = as_run([Result(task, one.settings, returns) for task, returns in one.returns.items()], found.agent)
         tables.append(run.table.assign(agent=found.agent, training=one.training, control=one.control))
         for cell, returns in run.cells.items():
             curves[one.control, cell.layout].append(returns)

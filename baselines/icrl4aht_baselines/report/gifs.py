@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_baselines.agents.egos import AGENTS, PlayMode, find_agent
+from icrl4aht_baselines.agents.egos import AGENTS, find_agent
 from icrl4aht_baselines.evaluate.evaluator import MakeEgo, play_tasks
 from icrl4aht_baselines.evaluate.protocols import Protocol, controlled_name
 from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, ResultSource
@@ -19,6 +19,7 @@ from icrl4aht_baselines.training.seen import describe_overlap
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.render import save_episode
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.system import usable_cores
 
 _PROGRESS = "episodes of the report"
@@ -105,10 +106,9 @@ def family_gifs(
     """
     chosen: list[tuple[EvaluationRun, ResultCell]] = []
     for run in runs:
-        headroom, first = known_headroom(run.protocol), {}
-        for cell in sorted(run.cells, key=lambda cell: (cell.order[1:], not headroom.get(cell))):
-            first.setdefault(cell[1:], cell)
-        chosen += [(run, cell) for cell in first.values()]
+        headroom = known_headroom(run.protocol)
+        ordered = sorted(run.cells, key=lambda cell: (cell.order[1:], not headroom.get(cell)))
+        chosen += [(run, cells[0]) for cells in grouped(ordered, lambda cell: cell[1:]).values()]
     progress(_PROGRESS, 0, len(chosen))
     with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes most of the time
         drawn = [pool.submit(_draw_result, *each, folder / str(number), suite) for number, each in enumerate(chosen)]
@@ -152,7 +152,7 @@ def restore_ego(source: ResultSource) -> MakeEgo:
         raise OptionError(f"{name} is neither a reference ego, nor a bundled model, nor a model with a run folder")
     if "model" not in details and not Path(folder).is_dir():
         raise OptionError(f"its run folder {folder} is missing")
-    agent = find_agent(folder, **PlayMode.from_details(details)._asdict())
+    agent = find_agent(folder, acting=details.get("acting"), greedy=not details.get("sampled"))
     if agent.details != details:
         raise OptionError(f"{folder} holds another model: expected {details} as in the results, found {agent.details}")
     return agent.make

@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,6 +38,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, read_tasks_and_layouts, write_layouts_file
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.utils.text import counted_noun
 
@@ -172,8 +172,8 @@ class ResultSource(NamedTuple):
     folder: str
     settings: dict[str, Any]
     trained: dict[str, Any] | None
-    tasks: Mapping[ResultCell, tuple[Task, ...]] = MappingProxyType({})
-    seen: SeenInTraining | None = None
+    tasks: Mapping[ResultCell, tuple[Task, ...]]
+    seen: SeenInTraining | None
 
     @property
     def layouts(self) -> tuple[str, ...]:
@@ -251,9 +251,7 @@ def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
     """Return name of a block -> mean return in the block, (...), from the returns of all episodes, (..., episodes)."""
     episodes = returns.shape[-1]
     return {
-        name: returns[..., start:stop].mean(axis=-1)
-        for name, (start, stop) in BLOCKS.items()
-        if episodes > (start if start >= 0 else -start)
+        name: returns[..., start:stop].mean(axis=-1) for name, (start, stop) in BLOCKS.items() if episodes > abs(start)
     }
 
 
@@ -363,21 +361,19 @@ def as_run(
     known = bundled_by_id("test") | {task.task_id: task for task in tasks}
     if any(result.task_id not in known for result in results):
         known = bundled_by_id("validation") | bundled_by_id("diverse") | known
-    played: dict[ResultCell, list[tuple[Task, list[list[float]]]]] = defaultdict(list)
-    for result in results:
-        if result.task_id not in known:
-            raise OptionError(
-                f"{where}: {result.task_id!r} is neither a published test task, nor a validation task of this package, "
-                f"nor in the results' {OWN_TASKS}; evaluate again, or copy the manifest of the tasks to {OWN_TASKS}"
-            )
-        task = known[result.task_id]
-        played[cell_of(task)].append((task, result.returns))
+    if missing := [result.task_id for result in results if result.task_id not in known]:
+        raise OptionError(
+            f"{where}: {missing[0]!r} is neither a published test task, nor a validation task of this package, nor in "
+            f"the results' {OWN_TASKS}; evaluate again, or copy the manifest of the tasks to {OWN_TASKS}"
+        )
+    played = grouped(results, lambda result: cell_of(known[result.task_id]))
     seen = find_seen(settings, trained, where)
     agent, seeds = (settings["agent"], settings["protocol"]["name"]), settings["seeds"]
     rows, cells, tracks = [], {}, defaultdict(dict)
     for cell in in_order(played):
-        of_cell, track = tuple(task for task, _ in played[cell]), "" if "" in seen else track_of(cell.layout)
-        returns = np.array([of_task for _, of_task in played[cell]], np.float64)  # (tasks, seeds, episodes)
+        of_cell = tuple(known[result.task_id] for result in played[cell])
+        track = "" if "" in seen else track_of(cell.layout)
+        returns = np.array([result.returns for result in played[cell]], np.float64)  # (tasks, seeds, episodes)
         cells[cell], tracks[track][cell] = returns.mean(axis=1), of_cell
         overlaps, names = find_overlaps(of_cell, seen[track]), [task_label(task.task_id) for task in of_cell]
         rows += [
@@ -414,13 +410,11 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
     merged: list[EvaluationRun] = []
     for run in runs:
         same = [other for other in merged if (other.label, other.protocol) == (run.label, run.protocol)]
-        fitting = [
-            other for other in same if _rule_key(other) == _rule_key(run) and not other.cells.keys() & run.cells.keys()
-        ]
-        if not fitting:
+        fitting = (other for other in same if _rule_key(other) == _rule_key(run))
+        other = next((other for other in fitting if other.cells.keys().isdisjoint(run.cells)), None)
+        if other is None:
             merged.append(replace(run, note=run.sources[0].folder) if same else run)
             continue
-        other = fitting[0]
         both = other.cells | run.cells
         cells = {cell: both[cell] for cell in in_order(both)}
         table, sources = pd.concat([other.table, run.table], ignore_index=True), other.sources + run.sources

@@ -21,7 +21,6 @@ import pandas as pd
 from icrl4aht_baselines.evaluate.evaluator import ControlledResults
 from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS
 from icrl4aht_baselines.report.results import (
-    CELL_COLUMNS,
     EPISODE_BLOCKS,
     TASK_KINDS,
     AgentReturns,
@@ -46,6 +45,7 @@ from icrl4aht_data.benchmark.best_responses import best_responses, read_best_res
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LEAST_HEADROOM, TRACKS
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom, same_behaviour_tasks, stay_returns
 from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_noun
 
 
@@ -95,11 +95,8 @@ CellScales = Mapping[ResultCell, CellScale]
 @cache
 def bundled_cells() -> dict[ResultCell, list[str]]:
     """Return result cell -> task ids, for all tasks in the package."""
-    found: dict[ResultCell, list[str]] = defaultdict(list)
-    for split in EVALUATION_SPLITS:
-        for task in bundled_by_id(split).values():
-            found[cell_of(task)].append(task.task_id)
-    return {cell: found[cell] for cell in in_order(found)}
+    found = grouped([task for split in EVALUATION_SPLITS for task in bundled_by_id(split).values()], cell_of)
+    return {cell: [task.task_id for task in found[cell]] for cell in in_order(found)}
 
 
 def behaviour_names() -> dict[str, str]:
@@ -135,19 +132,14 @@ def add_scales(table: pd.DataFrame) -> pd.DataFrame:
     Unknown values are empty. Under the control `swapped`, only the block of the last episodes has values, because other
     teammates play before; under a protocol that swaps teammates there are no values.
     """
-    rows = []
+    scaled = table.assign(stay=np.nan, best=np.nan)
+    has_scale = (table["control"] != "swapped") | (table["block"] == "last 20")
     for protocol in table["protocol"].unique():
-        stays, bests = stay_returns(protocol), best_responses(protocol)
-        for cell, tasks in bundled_cells().items():
-            for task in tasks:
-                if task in stays or task in bests:
-                    best = bests[task].best if task in bests else None
-                    rows.append((protocol, *cell[:2], cell.kind, task_label(task), stays.get(task), best))
-    keys = ["protocol", *CELL_COLUMNS, "task"]
-    scaled = table.merge(pd.DataFrame(rows, columns=[*keys, "stay", "best"]), how="left", on=keys)
-    if "control" in scaled:
-        others = (scaled["control"] == "swapped") & (scaled["block"] != "last 20")
-        scaled.loc[others, ["stay", "best"]] = np.nan
+        own = has_scale & (table["protocol"] == protocol)
+        bests = {task: response.best for task, response in best_responses(protocol).items()}
+        for column, values in (("stay", stay_returns(protocol)), ("best", bests)):
+            by_label = {task_label(task): value for task, value in values.items()}
+            scaled.loc[own, column] = table.loc[own, "task"].map(by_label)
     return scaled
 
 
@@ -168,14 +160,12 @@ class Score(NamedTuple):
 
     Attributes:
         total: mean of N over the layouts.
-        layouts: layout -> N.
         middle: interquartile mean of (R - S) / (B - S) over the teammates' behaviours with headroom.
         worst: layout and family of the behaviour with the lowest value of (R - S) / (B - S), and this value.
         regret: mean of B - R over the tasks.
     """
 
     total: MeanInterval
-    layouts: dict[str, float]
     middle: MeanInterval
     worst: tuple[str, float]
     regret: float
@@ -207,7 +197,6 @@ def find_score(returns: AgentReturns, cells: Sequence[ResultCell], scales: CellS
     worst = int(np.argmin(values))
     return Score(
         total=ratio_interval([*groups.values()]),
-        layouts={layout: ratio_interval([group]).mean for layout, group in groups.items()},
         middle=interquartile_mean(np.array(values)),
         worst=(labels[worst], values[worst]),
         regret=float(np.concatenate(regrets).mean()),

@@ -19,8 +19,8 @@ from msgspec import Meta
 from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import AGENTS, OTHER_WAYS
 from icrl4aht_baselines.evaluate.protocols import CONTROLS, bundled_tasks, get_protocol
-from icrl4aht_baselines.evaluate.results import RESULTS, Result
-from icrl4aht_baselines.report.results import EvaluationRun, as_run, find_seen, read_results
+from icrl4aht_baselines.evaluate.results import RESULTS
+from icrl4aht_baselines.report.results import find_seen, read_results
 from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -271,11 +271,3 @@ def read_submission(path: Path) -> Submission:
         ) from error
     check_submission(found, str(path))
     return found
-
-
-def submitted_runs(found: Submission) -> list[tuple[Evaluation, EvaluationRun]]:
-    """Return each evaluation of a submission together with its results as an `EvaluationRun`."""
-    return [
-        (one, as_run([Result(task, one.settings, returns) for task, returns in one.returns.items()], found.agent))
-        for one in found.evaluations
-    ]

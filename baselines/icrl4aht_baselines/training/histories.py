@@ -71,14 +71,13 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             f"labels = {labels}: {name} learns from the histories' own actions and rewards; leave out --labels, or "
             f"train another method"
         )
-    parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
     samplers = {
         part: number_layouts(
             _sampler(method, selection, options, model, histories, labels),
             dataset.layouts,
             histories.mirror,
         )
-        for part, selection in parts.items()
+        for part, selection in split._asdict().items()
         if selection is not None
     }
     about = {
@@ -366,8 +365,7 @@ def read_trained(folder: Path) -> TrainedModel:
         histories, train = config["histories"], config["train"]
         # An option that this version does not have is an error only if the run used it.
         stated = {k: v for k, v in config["model"].items() if v or hasattr(ModelOptions(), k)}
-        options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stated.items()}
-        model = ModelOptions(**options)
+        model = ModelOptions(**stated)
         layouts = [get_layout(name) for name in histories["layouts"]]
         channels, obs_shape = histories["channels"], tuple(histories["obs_shape"])
         expected = observation_shape(layouts[0], channels == "canonical")

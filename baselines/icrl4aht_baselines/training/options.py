@@ -97,9 +97,14 @@ class ResponseOptions:
         check_options(self)
 
     @property
+    def steps_per_update(self) -> int:
+        """Number of environment steps of a training step, which plays one episode of every task."""
+        return self.tasks * KEPT_STEPS
+
+    @property
     def updates(self) -> int:
-        """Number of training steps, each of which plays one episode of every task."""
-        return max(1, self.steps // (self.tasks * KEPT_STEPS))
+        """Number of training steps."""
+        return max(1, self.steps // self.steps_per_update)
 
     def training(self, seed: int) -> TrainOptions:
         """Return the options of the trainer for a run with this seed."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, SupportsIndex, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array
 
 from icrl4aht_data.benchmark.tasks import Task, parse_task
 from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice
@@ -156,14 +156,11 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         scripted = np.int32(self._script[0]) if len(self._script) else np.int32(-1)
         recipe = self._recipes[0] if len(self._recipes) else np.uint8(0)
         self._script, self._recipes = self._script[1:], self._recipes[1:]
-        played = self._step(self._params, moment, np.int32(number), scripted, recipe)
-        self._current = played.after
-        info = {
-            "state": self.state,
-            "teammate_action": int(played.teammate_action),
-            "shaped_rewards": np.asarray(played.shaped)[0],
-        }
-        return np.asarray(played.observation)[0], float(played.reward[0]), False, False, info
+        self._current, observation, reward, shaped, other = self._step(
+            self._params, moment, np.int32(number), scripted, recipe
+        )
+        info = {"state": self.state, "teammate_action": int(other), "shaped_rewards": np.asarray(shaped)[0]}
+        return np.asarray(observation)[0], float(reward[0]), False, False, info
 
     def render(self) -> np.ndarray | None:
         """Return a picture of the state, uint8 (height, width, 3), or None without a render mode."""
@@ -202,21 +199,15 @@ class _RunningEpisode(NamedTuple):
     memory: Any
 
 
-class _StepResult(NamedTuple):
-    """Result of a step: float32 reward (1,) and shaped rewards (1, 2), observation uint8 (1, 5, 5, C)."""
-
-    after: _RunningEpisode
-    observation: UInt8[Array, "1 5 5 C"]
-    reward: Float[Array, " 1"]
-    shaped: Float[Array, "1 2"]
-    teammate_action: Int[Array, ""]
-
-
 @lru_cache(maxsize=16)
 def _compiled_functions(
     layout: Layout, policy: Policy, canonical: bool
-) -> tuple[Callable[..., tuple[_RunningEpisode, Array]], Callable[..., _StepResult]]:
-    """Return two compiled functions for a layout and a teammate family: one starts an episode, one plays a step."""
+) -> tuple[Callable[..., tuple[_RunningEpisode, Array]], Callable[..., tuple[Any, ...]]]:
+    """Return two compiled functions for a layout and a teammate family: one starts an episode, one plays a step.
+
+    A step returns the running episode, the observation uint8 (1, 5, 5, C), the reward float32 (1,), the shaped rewards
+    float32 (1, 2) and the teammate's action.
+    """
     env = Environment(layout)
     teammate = lambda params: policy_player(env, policy, params, TEAMMATE, 1)  # noqa: E731
 
@@ -227,7 +218,7 @@ def _compiled_functions(
         state = state._replace(record=drawn if record is None else jnp.asarray(record)[None])
         return _RunningEpisode(state, teammate(params).init(state)), observe(layout, state.record, EGO, canonical)
 
-    def step(params, moment: _RunningEpisode, action, scripted, recipe) -> _StepResult:
+    def step(params, moment: _RunningEpisode, action, scripted, recipe) -> tuple[Any, ...]:
         state = moment.env
         # The key has no effect: heuristics use their own keys, and learned teammates act greedily.
         choice, memory = teammate(params).act(moment.memory, state, jax.random.key(0))
@@ -236,6 +227,6 @@ def _compiled_functions(
         outcome = rules.step(layout, state.record, jnp.stack([action, other])[None], following)
         after = _RunningEpisode(state._replace(clock=state.clock + 1, record=outcome.state), memory)
         seen = observe(layout, outcome.state, EGO, canonical)
-        return _StepResult(after, seen, outcome.reward, outcome.shaped, other)
+        return after, seen, outcome.reward, outcome.shaped, other
 
     return jax.jit(start), jax.jit(step)

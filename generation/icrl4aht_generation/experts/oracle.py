@@ -13,6 +13,8 @@ record. All times are in steps. Arrays of pots contain pots that the ego cannot 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -115,8 +117,9 @@ def _update_memory(scene: Scene, last: OracleMemory) -> OracleMemory:
     )
 
 
-class OracleView(NamedTuple):
-    """Features of one state from the ego's point of view, as traced arrays.
+@dataclass(frozen=True, eq=False)
+class OracleView:
+    """Features of one state from the ego's point of view, as traced arrays; properties are computed at first use.
 
     Attributes:
         facts: precomputed properties of the layout.
@@ -156,7 +159,7 @@ class OracleView(NamedTuple):
     careful: Bool[Array, ""]
     mate_delivers: Bool[Array, ""]
 
-    @property
+    @cached_property
     def dish(self) -> UInt8[Array, ""]:
         """Item byte of the current recipe's soup on a plate."""
         return self.recipes[0] | _DISH
@@ -165,12 +168,12 @@ class OracleView(NamedTuple):
         """Return the steps to each cell of a mask, plus `then` further steps. All other cells cost NEVER."""
         return jnp.where(mask & self.facts.mine, self.time + then, NEVER)
 
-    @property
+    @cached_property
     def pot_times(self) -> Int[Array, " P"]:
         """Steps until the ego faces each pot."""
         return self.time[jnp.minimum(jnp.asarray(self.scene.tables.pots), self.time.shape[0] - 1)]
 
-    @property
+    @cached_property
     def steps_to_pots(self) -> Int[Array, "cells P"]:
         """Steps from facing each cell to facing each pot."""
         return _steps(jnp.asarray(self.facts.leg))
@@ -180,19 +183,19 @@ class OracleView(NamedTuple):
         there = jnp.where(which & self.facts.pots, self.pot_times + then, NEVER)
         return jnp.where(self.scene.cells_of_kind(POT), self.scene.at(POT, there), NEVER)
 
-    @property
+    @cached_property
     def parking_cost(self) -> Int[Array, " cells"]:
         """Cost of each counter for putting down an item; low if unshared, or near pots if the ego only cooks."""
         facts = self.facts
         near = 2 * jnp.min(self.steps_to_pots, axis=1, initial=FAR)
         return self.cost(self.scene.empty_counters, jnp.where(facts.serves, 3 * jnp.asarray(facts.shared), near))
 
-    @property
+    @cached_property
     def plate_cells(self) -> Bool[Array, " cells"]:
         """Cells where the ego can take a plate."""
         return (self.scene.plate_piles | (self.items == PLATE)) & self.facts.mine
 
-    @property
+    @cached_property
     def plan_costs(self) -> Int[Array, "P Q"]:
         """Cost of cooking each recipe in each pot; lower for recipes with few soups in stock, then with little work."""
         trip = jnp.asarray(self.facts.trip)[:, None]
@@ -206,18 +209,18 @@ class OracleView(NamedTuple):
         # A soup in stock counts more than any walk, because walks are shorter than 200 steps.
         return jnp.where(possible & (wanted | ~self.careful), 200 * (self.stock - current + 1) + work, NEVER)
 
-    @property
+    @cached_property
     def spoiled_pots(self) -> Bool[Array, " P"]:
         """Pots with contents that fit no recipe, which the ego fills up and clears if no other pot is left."""
         nowhere = self.facts.pots & ~self.full & (self.contents > 0) & (jnp.min(self.plan_costs, axis=1) == NEVER)
         return nowhere & (self.stock[0] == 0) & self.facts.serves
 
-    @property
+    @cached_property
     def must_clear(self) -> Bool[Array, ""]:
         """Whether the ego must take wrong soups out of pots."""
         return self.risky | ((self.stock[0] == 0) & (jnp.min(self.plan_costs[:, 0]) == NEVER))
 
-    @property
+    @cached_property
     def teammate_pots(self) -> Bool[Array, " P"]:
         """Pots left to the teammate: that of the first right soup, if the teammate also cooks and is not idle."""
         first = jnp.arange(len(self.timers)) == jnp.argmin(jnp.where(self.right, self.timers, NEVER))
@@ -228,7 +231,7 @@ class OracleView(NamedTuple):
         idles = (self.memory.calm >= WAIT_LIMIT) & (self.timers == 0)
         return self.right & first & self.careful & ~self.memory.parks & ~elsewhere & ~idles
 
-    @property
+    @cached_property
     def waiting_pots(self) -> Bool[Array, " P"]:
         """Pots in front of which the ego waits instead of interacting."""
         hand, mixed = self.scene.hand, self.contents + self.scene.hand
@@ -298,12 +301,10 @@ class Subgoal(NamedTuple):
     Attributes:
         when: bool (), whether the subgoal applies.
         cost: int32 (cells,), cost of going to each cell in steps; NEVER for unsuitable cells.
-        reason: purpose of the subgoal, for readers of the code.
     """
 
     when: Bool[Array, ""]
     cost: Int[Array, " cells"]
-    reason: str
 
 
 def _choose_action(view: OracleView) -> Int[Array, ""]:
@@ -328,11 +329,16 @@ def _dish_subgoals(view: OracleView) -> list[Subgoal]:
     near = view.cost(scene.empty_counters & facts.shared, scene.manhattan(scene.cell, scene.partner) - view.time)
     comes = scene.holds_nothing & (scene.partner_hand == view.dish) & ~jnp.any(facts.pots)
     return [
-        Subgoal(scene.hand == view.dish, view.cost(scene.goals), "deliver the current recipe"),
-        Subgoal(scene.holds_dish, view.parking_cost, "keep a dish for its recipe: a wrong delivery costs 20"),
-        Subgoal(scene.holds_nothing, view.cost(wanted), "take a ready dish: it earns most per step"),
-        Subgoal(jnp.any(wanted), view.parking_cost, "free the hand for a ready dish"),
-        Subgoal(comes, near, "wait where the teammate puts down a dish that only the ego can deliver"),
+        # Deliver the current recipe.
+        Subgoal(scene.hand == view.dish, view.cost(scene.goals)),
+        # Keep a dish for its recipe: a wrong delivery costs 20.
+        Subgoal(scene.holds_dish, view.parking_cost),
+        # Take a ready dish: it earns most per step.
+        Subgoal(scene.holds_nothing, view.cost(wanted)),
+        # Free the hand for a ready dish.
+        Subgoal(jnp.any(wanted), view.parking_cost),
+        # Wait where the teammate puts down a dish that only the ego can deliver.
+        Subgoal(comes, near),
     ]
 
 
@@ -343,13 +349,12 @@ def _plate_subgoals(view: OracleView) -> list[Subgoal]:
     # The ego waits in front of a soup that is not done, so waiting counts like walking.
     rest = jnp.maximum(view.timers - view.pot_times, 0)
     return [
-        Subgoal(holds & (soon | ~building), view.cost_at_pots(right, rest), "plate the soup of the current recipe"),
-        Subgoal(
-            holds & (view.must_clear | ~building),
-            view.cost_at_pots(view.full & ~view.right, rest),
-            "empty a pot of a wrong soup",
-        ),
-        Subgoal(holds, view.parking_cost, "put the plate down: no soup needs it, but a pot needs ingredients"),
+        # Plate the soup of the current recipe.
+        Subgoal(holds & (soon | ~building), view.cost_at_pots(right, rest)),
+        # Empty a pot of a wrong soup.
+        Subgoal(holds & (view.must_clear | ~building), view.cost_at_pots(view.full & ~view.right, rest)),
+        # Put the plate down: no soup needs it, but a pot needs ingredients.
+        Subgoal(holds, view.parking_cost),
     ]
 
 
@@ -361,28 +366,28 @@ def _ingredient_subgoals(view: OracleView) -> list[Subgoal]:
     spare = (view.recipes == view.recipes[0]) | (view.stock[0] > 0) | (jnp.sum(fits) > fits)[:, None]
     plans = jnp.min(jnp.where(takes & (spare | ~jnp.any(fits)), view.plan_costs, NEVER), axis=1)
     return [
-        Subgoal(holds, view.cost_at_pots(plans < NEVER, plans), "cook the recipe in the pot that cost least together"),
-        Subgoal(holds & ~jnp.any(fits), view.cost_at_pots(view.spoiled_pots), "fill a spoiled pot to clear it"),
-        Subgoal(
-            holds & ~view.facts.serves,
-            view.cost_at_pots(view.full | view.mate_delivers),
-            "wait at the pot for the teammate, who serves",
-        ),
-        Subgoal(holds, view.parking_cost, "put down an ingredient that no recipe needs"),
+        # Cook the recipe in the pot that cost least together.
+        Subgoal(holds, view.cost_at_pots(plans < NEVER, plans)),
+        # Fill a spoiled pot to clear it.
+        Subgoal(holds & ~jnp.any(fits), view.cost_at_pots(view.spoiled_pots)),
+        # Wait at the pot for the teammate, who serves.
+        Subgoal(holds & ~view.facts.serves, view.cost_at_pots(view.full | view.mate_delivers)),
+        # Put down an ingredient that no recipe needs.
+        Subgoal(holds, view.parking_cost),
     ]
 
 
 def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
     facts, scene, plans = view.facts, view.scene, view.plan_costs
     empty = scene.holds_nothing
-    to_pot, first = view.steps_to_pots, jnp.argmax(facts.pots)
+    to_pot = view.steps_to_pots
 
     def fetch(ingredients: Bool[Array, " types"], then: Array) -> Int[Array, " cells"]:
         return view.cost(jnp.any(view.sources & ingredients[:, None], axis=0), then)
 
-    def plate_for(which: Bool[Array, " P"], reason: str) -> Subgoal:
+    def plate_for(which: Bool[Array, " P"]) -> Subgoal:
         then = jnp.min(jnp.where(which, to_pot, FAR), axis=1)
-        return Subgoal(empty & jnp.any(which), view.cost(view.plate_cells, then), reason)
+        return Subgoal(empty & jnp.any(which), view.cost(view.plate_cells, then))
 
     pot, recipe = jnp.unravel_index(jnp.argmin(plans), plans.shape)
     builds = empty & (jnp.min(plans) < NEVER)
@@ -398,20 +403,24 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
     due = view.timers <= arrival + 2
     right = view.right & ~view.teammate_pots & facts.serves
     wrong = view.full & ~view.right & view.must_clear & facts.serves
-    used = jnp.any(scene.counts(view.recipes) > 0, axis=0)
+    any_ingredient = fetch(jnp.any(scene.counts(view.recipes) > 0, axis=0), to_pot[:, jnp.argmax(facts.pots)])
     return [
-        Subgoal(builds & quick & ~view.risky, ingredients, "finish a pot that needs few steps, then fetch a plate"),
-        plate_for(right & due, "fetch a plate so that it arrives when the soup is done"),
-        plate_for(wrong & due & view.risky, "take a wrong soup before the teammate serves it"),
-        Subgoal(builds, ingredients, "fetch an ingredient to cook"),
-        plate_for(right, "wait with a plate, because nothing can be cooked"),
-        plate_for(wrong, "empty a pot that blocks the current recipe"),
-        Subgoal(empty & jnp.any(view.spoiled_pots), fetch(used, to_pot[:, first]), "fill up a spoiled pot"),
-        Subgoal(
-            empty & (jnp.any(view.full) | view.mate_delivers) & ~facts.serves,
-            fetch(used, to_pot[:, first]),
-            "hold an ingredient ready for the next soup, as an ego that only fills pots",
-        ),
+        # Finish a pot that needs few steps, then fetch a plate.
+        Subgoal(builds & quick & ~view.risky, ingredients),
+        # Fetch a plate so that it arrives when the soup is done.
+        plate_for(right & due),
+        # Take a wrong soup before the teammate serves it.
+        plate_for(wrong & due & view.risky),
+        # Fetch an ingredient to cook.
+        Subgoal(builds, ingredients),
+        # Wait with a plate, because nothing can be cooked.
+        plate_for(right),
+        # Empty a pot that blocks the current recipe.
+        plate_for(wrong),
+        # Fill up a spoiled pot.
+        Subgoal(empty & jnp.any(view.spoiled_pots), any_ingredient),
+        # Hold an ingredient ready for the next soup, as an ego that only fills pots.
+        Subgoal(empty & (jnp.any(view.full) | view.mate_delivers) & ~facts.serves, any_ingredient),
     ]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -46,13 +45,9 @@ def padded_layout(layout: Layout, by_size: bool = False) -> PaddedLayout:
     """
     group = known_layouts()
     if by_size:
-        own = _size_class(layout)
-        group = [one for one in group if _size_class(one) == own]
+        own = bisect_left(_SIZE_CLASSES, layout.cells)
+        group = [one for one in group if bisect_left(_SIZE_CLASSES, one.cells) == own]
     return _pad_to_largest(layout, tuple(group))
-
-
-def _size_class(layout: Layout) -> int:
-    return bisect_left(_SIZE_CLASSES, layout.cells)
 
 
 def unpadded_layout(layout: Layout) -> PaddedLayout:
@@ -62,7 +57,7 @@ def unpadded_layout(layout: Layout) -> PaddedLayout:
 
 @lru_cache(maxsize=1024)
 def _pad_to_largest(layout: Layout, others: tuple[Layout, ...]) -> PaddedLayout:
-    group = [layout, *_largest_of(others)]
+    group = [layout, *largest_layouts(others)]
     tables = jax.tree.map(lambda leaf: leaf[0], stack_tables(group))
     facts, blank = oracle_params(group)
     oracle = jax.tree.map(lambda leaf: leaf[:1], facts), blank
@@ -70,12 +65,10 @@ def _pad_to_largest(layout: Layout, others: tuple[Layout, ...]) -> PaddedLayout:
 
 
 @lru_cache(maxsize=8)
-def _largest_of(layouts: tuple[Layout, ...]) -> list[Layout]:
-    return largest_layouts(layouts) if layouts else []
-
-
-def largest_layouts(layouts: Sequence[Layout]) -> list[Layout]:
+def largest_layouts(layouts: tuple[Layout, ...]) -> list[Layout]:
     """Return layouts that together have the largest size of every axis of the tables and of `LayoutFacts`."""
+    if not layouts:
+        return []
     sizes = np.array([_axis_sizes(layout) for layout in layouts])
     return [layouts[number] for number in dict.fromkeys(sizes.argmax(axis=0).tolist())]
 

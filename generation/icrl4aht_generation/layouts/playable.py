@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import astuple
 from functools import cached_property
 from typing import Any
 
@@ -41,7 +42,7 @@ def layouts_delivered(
         layouts: layouts to test.
         checked: called with the number of layouts decided since the last call, to show progress.
     """
-    found, largest = np.zeros(len(layouts), bool), largest_layouts(layouts)
+    found, largest = np.zeros(len(layouts), bool), largest_layouts(tuple(layouts))
     for tries in (_QUICK, _THOROUGH):
         missing = np.flatnonzero(~found)
         for start in range(0, len(missing), _AT_ONCE):
@@ -62,7 +63,7 @@ def _can_deliver(
     own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
     # Computing `LayoutFacts` takes longer than an episode, so all tries of a batch share the result.
-    egos = oracle_params(own), oracle_params([_with_exchanged_agents(layout) for layout in own])
+    egos = oracle_params(own), oracle_params([_ExchangedLayout(*astuple(layout)) for layout in own])
     starts = np.array([layout.agent_cells for layout in own], np.uint8)
     earned = np.zeros(len(own), bool)
     for hundreds, playing, at_starts in tries:
@@ -110,12 +111,9 @@ def _play(tables: Tables, egos: tuple[Any, Any], playing: Any, carry: RolloutCar
     return carry, played.reward.max(axis=0)
 
 
-def _with_exchanged_agents(layout: Layout) -> Layout:
-    """Return a layout with exchanged start cells of the agents, for a policy that can only play the ego."""
-    return _ExchangedLayout(layout.name, layout.alias, layout.rows, layout.recipes, layout.indicates_delivery)
-
-
 class _ExchangedLayout(Layout):
+    """Layout with exchanged start cells of the agents, for a policy that can only play the ego."""
+
     @cached_property
     def agent_cells(self) -> tuple[int, ...]:
         return super().agent_cells[::-1]

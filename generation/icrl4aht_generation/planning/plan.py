@@ -7,7 +7,7 @@ follows from the hyper-parameters. Stored numbers give the speed of the environm
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import lru_cache
 from timeit import repeat
 from typing import Any
@@ -124,7 +124,8 @@ def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
         "scripted_transitions": sum(transitions),
         "recorded_transitions": sum(ego.environments * ego.episodes * KEPT_STEPS for _, ego in egos) + sum(transitions),
         "kept_transitions": sum(kept.values()),
-        "artefact_bytes": artefact_bytes(egos) + sum(scripted_bytes(layout, config) for layout, config in scripted),
+        "artefact_bytes": sum(arrays_bytes(array_shapes(at, ego.environments, ego.episodes)) for at, ego in egos)
+        + sum(scripted_bytes(layout, config) for layout, config in scripted),
         "lite_bytes": sizes["lite"],
         "full_bytes": sizes["full"],
         "device": f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
@@ -180,8 +181,3 @@ def forward_seconds(layout: Layout, config: PPOConfig) -> float:
     call()  # the first call compiles
     # Take the fastest of a few calls, because other programs may slow down some calls.
     return min(repeat(call, number=1, repeat=3)) / (steps * count)
-
-
-def artefact_bytes(egos: Iterable[tuple[Layout, PPOConfig]]) -> int:
-    """Return the uncompressed size in bytes of the histories of all egos."""
-    return sum(arrays_bytes(array_shapes(layout, ego.environments, ego.episodes)) for layout, ego in egos)

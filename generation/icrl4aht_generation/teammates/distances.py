@@ -19,11 +19,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key, UInt8
+from jaxtyping import Array, UInt8
 
 from icrl4aht_data.benchmark.facts import (
-    HEURISTIC_KINDS,
-    KEPT_STEPS,
     LAYOUT_NAMES,
     LEAST_HEADROOM,
     SAME_BEHAVIOUR,
@@ -31,16 +29,13 @@ from icrl4aht_data.benchmark.facts import (
 )
 from icrl4aht_data.errors import check_choice
 from icrl4aht_data.format.provenance import NearestTest
-from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.overcooked.tables import Tables
-from icrl4aht_generation.env import Environment
-from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
+from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.padded import padded_layout
-from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
-from icrl4aht_generation.policy import Policy, Situation
+from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.draws import (
     DIVERSE_DISTANCE,
     DRAWS_PER_SEED,
@@ -49,8 +44,13 @@ from icrl4aht_generation.teammates.draws import (
     read_measured,
     write_table,
 )
-from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_teammates
-from icrl4aht_generation.teammates.references import REFERENCE_EGOS, reference_returns, stacked_families
+from icrl4aht_generation.teammates.instances import INSTANCE_NAMES, INSTANCES, TESTED_FAMILIES, published_teammates
+from icrl4aht_generation.teammates.references import (
+    REFERENCE_EGOS,
+    play_reference_egos,
+    reference_returns,
+    stacked_families,
+)
 from icrl4aht_generation.teammates.registry import (
     HEURISTIC_FAMILIES,
     build_teammate,
@@ -70,11 +70,6 @@ _EPISODES = 10
 """Number of episodes of each test instance with each of the two egos."""
 
 _SEED = 5
-
-
-INSTANCE_NAMES = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FAMILIES for t in range(INSTANCES))
-"""Names of the test instances, such as "H3/t1", by family and number."""
-
 
 _DIGITS = 4
 """Decimal places of stored numbers, which are exact for shares of 10,000 states and means of 20 returns."""
@@ -99,7 +94,7 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
     Raises:
         UnknownNameError: if the benchmark does not have the layout.
     """
-    records, tested = common_states(layout)
+    records, tested = common_states(layout, _EPISODES)
     actions = act_on_records(layout, policies, records)
     distances = distances_to_tests(tested, actions)
     nearest = distances.argmin(axis=1)
@@ -110,8 +105,12 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
 
 
 @lru_cache(maxsize=2)
-def common_states(layout: Layout) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
+def common_states(layout: Layout, episodes: int = _EPISODES) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
     """Return the states of a layout on which teammates are compared, and the actions of the test instances.
+
+    Args:
+        layout: layout of the states.
+        episodes: number of episodes of each test instance with each of the two egos.
 
     Returns:
         State records, see `common_records`, and the actions of the test instances, int8 (instances, T, N).
@@ -119,19 +118,15 @@ def common_states(layout: Layout) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
     Raises:
         UnknownNameError: if the benchmark does not have the layout.
     """
-    records = common_records(layout)
+    records = common_records(layout, episodes)
     return records, act_on_records(layout, instance_policies(layout), records)
 
 
 def instance_policies(layout: Layout) -> list[Policy]:
-    """Return the policies of all test instances of a layout, which see a `Situation`."""
-    return [build_teammate(None, entry) for entry in instance_entries(layout)]
-
-
-def instance_entries(layout: Layout) -> list[dict[str, Any]]:
-    """Return the test instances that test models trained on a layout, by family and number."""
+    """Return the test instances that test models trained on a layout, by family and number, which see a `Situation`."""
     tested = TESTED_ON.get(layout.name, layout.name)
-    return [entry for family in TESTED_FAMILIES for entry in published_teammates(tested, family)]
+    entries = [entry for family in TESTED_FAMILIES for entry in published_teammates(tested, family)]
+    return [build_teammate(None, entry) for entry in entries]
 
 
 def common_records(layout: Layout, episodes: int = _EPISODES) -> UInt8[Array, "T N S"]:
@@ -145,35 +140,11 @@ def common_records(layout: Layout, episodes: int = _EPISODES) -> UInt8[Array, "T
         UnknownNameError: if the benchmark does not have the layout.
     """
     check_choice("layout", layout.name, LAYOUT_NAMES)
-    families = [family for _, family in stacked_families(instance_policies(layout))]
-    tables, expert, positions = padded_layout(layout)
-    play = _compiled_test_play(tuple(family._replace(params=()) for family in families), episodes)
-    return play(tables, expert, [family.params for family in families], jax.random.key(_SEED))[..., positions]
-
-
-@lru_cache(maxsize=2)
-def _compiled_test_play(families: tuple[Policy, ...], episodes: int) -> Callable[..., Array]:
-    """Return a compiled function that plays the test instances and returns state records."""
-    each = INSTANCES * 2 * episodes
-    total = len(families) * each
+    mates = instance_policies(layout)
     # Teammates are compared both on unusual states with random egos and on states of good play with the oracle.
-    with_oracle = np.arange(total) // episodes % 2 == 1
-
-    @jax.jit
-    def play(tables: Tables, expert: Any, params: Sequence[Any], key: Key[Array, ""]) -> Array:
-        env = Environment(tables, KEPT_STEPS)
-        players = [
-            policy_player(env, REFERENCE_EGOS["random"], (), EGO, total, only=np.flatnonzero(~with_oracle)),
-            policy_player(env, SITUATION_ORACLE, expert, EGO, total, only=np.flatnonzero(with_oracle)),
-        ]
-        for k, (family, own) in enumerate(zip(families, params, strict=True)):
-            envs = np.arange(k * each, (k + 1) * each)
-            repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2 * episodes, axis=0), own)
-            players.append(policy_player(env, family, repeated, TEAMMATE, total, own_params=True, only=envs))
-        carry = init_rollout(env, players, jax.random.split(key, total))
-        return roll_out(env, players, carry, env.max_steps, key)[1].record
-
-    return play
+    pairs = [(ego, mate) for mate in range(len(mates)) for ego in ("random", "oracle") for _ in range(episodes)]
+    keys = jax.random.split(jax.random.key(_SEED), len(pairs))
+    return play_reference_egos(layout, mates, pairs, keys, "record")[..., padded_layout(layout).positions]
 
 
 def act_on_records(layout: Layout, policies: Sequence[Policy], records: Array, seed: int = _SEED) -> np.ndarray:
@@ -188,51 +159,40 @@ def act_on_records(layout: Layout, policies: Sequence[Policy], records: Array, s
     Returns:
         Actions, int8 (policies, T, episodes).
     """
+    keys = jax.random.split(jax.random.key(seed), records.shape[1])
     actions = np.zeros((len(policies), *records.shape[:2]), np.int8)
     for numbers, family in stacked_families(policies):
-        actions[numbers] = np.asarray(_family_actions(layout, family, records, jax.random.key(seed)))
+        tables, seen = layout.tables, records
+        if family.sees == "situation":  # padded, so all layouts share one compilation
+            tables, _, positions = padded_layout(layout)
+            seen = jnp.zeros((*records.shape[:-1], record_size(tables)), jnp.uint8).at[..., positions].set(records)
+        actions[numbers] = _compiled_actions(family._replace(params=()))(family.params, seen, keys, tables)
     return actions
 
 
-def _family_actions(layout: Layout, family: Policy, records: Array, key: Key[Array, ""]) -> Array:
-    keys = jax.random.split(key, records.shape[1])
-    if family.sees == "situation":
-        # Padded tables are arguments, so all layouts share one compilation.
-        tables, _, positions = padded_layout(layout)
-        padded = jnp.zeros((*records.shape[:-1], record_size(tables)), jnp.uint8).at[..., positions].set(records)
-        return _compiled_situation_actions(family._replace(params=()))(family.params, padded, keys, tables)
-
-    def see(record: Array) -> Array:
-        return record if family.sees == "state" else observe(layout, record, TEAMMATE)
-
-    return jax.jit(lambda params: _actions(family, see, params, records, keys))(family.params)
-
-
 @lru_cache(maxsize=16)
-def _compiled_situation_actions(family: Policy) -> Callable[..., Array]:
-    """Return a compiled function of parameters, padded records, keys and tables that returns actions."""
+def _compiled_actions(family: Policy) -> Callable[..., Array]:
+    """Return a compiled function of stacked parameters, records, keys and tables.
 
+    The function returns actions on the records, int8 (policies, T, episodes).
+    """
+
+    @jax.jit
     def act(params: Any, records: Array, keys: Array, tables: Tables) -> Array:
-        return _actions(family, lambda record: Situation(tables, record), params, records, keys)
+        env, zero = Environment(tables), jnp.zeros(len(keys), jnp.int32)
 
-    return jax.jit(act)
+        def policy_actions(params: Any) -> Array:
+            def step(memories: Any, record: Array) -> tuple[Any, Array]:
+                state = EnvState(keys, zero, zero, record)
+                actions, memories = env.act(family, params, memories, state, TEAMMATE, keys, own=False)
+                return memories, actions.astype(jnp.int8)
 
+            memories = jax.vmap(family.init, in_axes=(None, 0))(params, keys)
+            return jax.lax.scan(step, memories, records)[1]
 
-def _actions(family: Policy, see: Callable[[Array], Any], params: Any, records: Array, keys: Array) -> Array:
-    """Return actions on records, int8 (policies, T, episodes); `see` converts a record to the policies' view."""
+        return jax.lax.map(policy_actions, params)  # one policy at a time, which bounds the memory
 
-    def policy_actions(params: Any) -> Array:
-        def step(memories: Any, record: Array) -> tuple[Any, Array]:
-            def act(memory: Any, single: Array, key: Array) -> Any:
-                return family.act(params, memory, see(single), key)
-
-            actions, memories = jax.vmap(act)(memories, record, keys)
-            return memories, actions.astype(jnp.int8)
-
-        memories = jax.vmap(family.init, in_axes=(None, 0))(params, keys)
-        return jax.lax.scan(step, memories, records)[1]
-
-    return jax.lax.map(policy_actions, params)  # one policy at a time, which bounds the memory
+    return act
 
 
 def distances_to_tests(tested: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -308,13 +268,8 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
         layout: layout of the measurements.
         numbers: family, base_seed and theta_id of each sampled teammate.
     """
-    policies = [
-        build_teammate(layout, sample_teammate(family, theta_id, ranges_of(seed), seed))
-        for family, seed, theta_id in numbers
-    ]
-    records, tested = common_states(layout)
-    actions = act_on_records(layout, policies, records)
-    distances, returns = distances_to_tests(tested, actions), reference_returns(layout, policies)
+    drawn = [sample_teammate(family, theta_id, ranges_of(seed), seed) for family, seed, theta_id in numbers]
+    actions, distances, returns = _measure(layout, drawn, _EPISODES)
     families = np.array([family for family, _, _ in numbers])
     behaviours = np.zeros(len(numbers), int)
     for family in np.unique(families):
@@ -330,6 +285,22 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
         )
         for k, (family, base_seed, theta_id) in enumerate(numbers)
     ]
+
+
+def _measure(
+    layout: Layout, entries: Sequence[dict[str, Any]], episodes: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the actions of teammates on the common states, distances to the test instances, and reference returns.
+
+    Args:
+        layout: the training layout.
+        entries: entries of heuristic teammates.
+        episodes: number of episodes of the common states, see `common_states`.
+    """
+    records, tested = common_states(layout, episodes)
+    policies = [build_teammate(None, entry) for entry in with_equal_parameters(entries)]
+    actions = act_on_records(layout, policies, records)
+    return actions, distances_to_tests(tested, actions), reference_returns(layout, policies)
 
 
 def _measured_fields(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[str, Any]:
@@ -358,12 +329,7 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]]) -> Layo
         layout: the training layout.
         candidates: entries of heuristic teammates.
     """
-    # Candidates and test instances act together, so each family needs only one compilation.
-    tested, records = instance_entries(layout), common_records(layout, _SPREAD_EPISODES)
-    policies = [build_teammate(None, entry) for entry in with_equal_parameters([*tested, *candidates])]
-    actions, policies = act_on_records(layout, policies, records), policies[len(tested) :]
-    tests, actions = distances_to_tests(actions[: len(tested)], actions[len(tested) :]), actions[len(tested) :]
-    returns = reference_returns(layout, policies)  # all candidates play, so layouts share one compilation
+    actions, tests, returns = _measure(layout, candidates, _SPREAD_EPISODES)
     unlike = tests.min(axis=1) >= DIVERSE_DISTANCE
     headroom = unlike & (np.ptp(returns, axis=1) >= LEAST_HEADROOM)
     usable = np.flatnonzero(headroom if headroom.any() else unlike)

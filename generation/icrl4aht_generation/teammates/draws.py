@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -155,14 +155,10 @@ def drawn_teammates(
         Teammate entries, as `sample_teammate` returns them, with their draws.
 
     Raises:
-        OptionError: if a family does not exist or has no admissible draws on the layout, or if the families have fewer
-            draws than `count`.
-        UnknownNameError: if the layout or seed does not exist, or the layout has no training tasks.
+        OptionError: if a family has no admissible draws on the layout, or the families have fewer draws than `count`.
+        UnknownNameError: if the layout, family or seed does not exist, or the layout has no training tasks.
     """
     name = get_layout(layout).name
-    for family in families:
-        if family not in HEURISTIC_FAMILIES:
-            raise OptionError(str(unknown("teammate family", family, HEURISTIC_FAMILIES)))
     queues = [_ordered_draws(name, family, base_seed) for family in dict.fromkeys(families)]
     available = sum(map(len, queues))
     if count > available:
@@ -213,19 +209,16 @@ def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
     family, seed, theta_id = (teammate.get(name) for name in ("family", "base_seed", "theta_id"))
     if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
         return None
-    draws = [draw for draw in read_draws(layout, str(family), seed) if draw.theta_id == theta_id]
-    same = draws and equal_parameters(_sampled_entry(str(family), draws[0].theta_id, seed)["theta"], teammate["theta"])
-    return draws[0] if same else None
+    for draw in read_draws(layout, str(family), seed):
+        if draw.theta_id == theta_id:
+            sampled = sample_teammate(draw.family, draw.theta_id, ranges_of(seed), seed)
+            return draw if equal_parameters(sampled["theta"], teammate["theta"]) else None
+    return None
 
 
 def equal_parameters(theta: Mapping[str, float], other: Mapping[str, float]) -> bool:
     """Return whether parameters are equal up to the last digit, which may differ between compilations."""
     return theta.keys() == other.keys() and all(math.isclose(theta[name], other[name], rel_tol=1e-6) for name in theta)
-
-
-@cache
-def _sampled_entry(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
-    return sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)
 
 
 def usable_families(layout: str, base_seed: int = 0) -> list[str]:

@@ -21,6 +21,9 @@ TESTED_FAMILIES = tuple(HEURISTIC_KINDS)
 INSTANCES = 5
 """Number of test instances of each family, t0 to t4."""
 
+INSTANCE_NAMES = tuple(f"{short}/t{number}" for short in HEURISTIC_KINDS.values() for number in range(INSTANCES))
+"""Names of the test instances, such as "H3/t1", by family and number."""
+
 
 def published_tasks(track: str) -> list[Task]:
     """Return the published test tasks of a track, by layout, family and instance."""
@@ -50,12 +53,9 @@ def published_task(layout: str, teammate: str) -> Task:
         UnknownNameError: if the layout, family or instance does not exist.
     """
     name = get_layout(layout).name
-    names = {
-        f"{short}/t{number}": entry
-        for family, short in HEURISTIC_KINDS.items()
-        for number, entry in enumerate(published_teammates(name, family))
-    }
-    check_choice("teammate", teammate, names)
+    check_choice("teammate", teammate, INSTANCE_NAMES)
+    family, number = divmod(INSTANCE_NAMES.index(teammate), INSTANCES)
+    entry = published_teammates(name, TESTED_FAMILIES[family])[number]
     track = track_of(name)
     split = "test" if name in TRACKS[track]["test"] else "train"
-    return make_task(track, split, name, names[teammate], seed=0)
+    return make_task(track, split, name, entry, seed=0)

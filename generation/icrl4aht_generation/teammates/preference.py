@@ -21,15 +21,11 @@ from icrl4aht_data.benchmark.tasks import Dish, Task, make_task
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_generation.teammates.heuristics.territory import LAZY, TERRITORY
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_teammates
-from icrl4aht_generation.teammates.registry import sample_teammate
+from icrl4aht_generation.teammates.registry import heuristic_entry, sample_teammate
 
-WATCHER: dict[str, Any] = {
-    "kind": "heuristic",
-    "family": TERRITORY.kind,
-    "theta_id": INSTANCES,
-    "base_seed": 0,
-    "theta": TERRITORY.defaults | {"behavior_mode": LAZY, "action_probability": 0.0},
-}
+WATCHER = heuristic_entry(
+    TERRITORY.kind, INSTANCES, 0, TERRITORY.defaults | {"behavior_mode": LAZY, "action_probability": 0.0}
+)
 """Entry of a teammate that never acts."""
 
 _DRAWS = {"train": 2, "validation": 3}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Key
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.format.provenance import ReferenceEgos
@@ -43,14 +43,10 @@ def reference_returns(layout: Layout, teammates: Sequence[Policy], episodes: int
     Returns:
         Mean return of each of `REFERENCE_EGOS` with each teammate, float64 (teammates, egos).
     """
-    families = list(stacked_families(teammates))
-    # Policies that see observations or state records of one layout need the layout without padding.
-    every = all(family.sees == "situation" for _, family in families)
-    tables, expert, _ = (padded_layout if every else unpadded_layout)(layout)
-    play = _compile(
-        tuple((tuple(numbers), family._replace(params=())) for numbers, family in families), len(teammates), episodes
-    )
-    earned = np.asarray(play(tables, expert, [family.params for _, family in families]), np.float64)
+    starts = jax.random.split(jax.random.key(_SEED), episodes)
+    pairs = [(ego, mate) for ego in REFERENCE_EGOS for mate in range(len(teammates)) for _ in range(episodes)]
+    played = play_reference_egos(layout, teammates, pairs, jnp.tile(starts, len(pairs) // episodes), "reward")
+    earned = np.asarray(played, np.float64).sum(axis=0)
     return earned.reshape(len(REFERENCE_EGOS), len(teammates), episodes).mean(axis=-1).T
 
 
@@ -65,31 +61,58 @@ def reference_egos(returns: np.ndarray, self_play: float | None = None) -> Refer
     return ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES, self_play)
 
 
-@lru_cache(maxsize=16)
-def _compile(families: tuple[tuple[tuple[int, ...], Policy], ...], teammates: int, episodes: int) -> Callable[..., Any]:
-    """Return a compiled function that plays all pairs and returns the episodes' returns.
+def play_reference_egos(
+    layout: Layout,
+    teammates: Sequence[Policy],
+    pairs: Sequence[tuple[str, int]],
+    keys: Key[Array, " N"],
+    field: Literal["record", "reward"],
+) -> Array:
+    """Play episodes of 100 steps of reference egos with teammates.
 
-    Its arguments are the layout's tables, and the parameters of the oracle and of each family.
+    Args:
+        layout: layout of the episodes.
+        teammates: policies that play agent 1; at least one.
+        pairs: ego, one of `REFERENCE_EGOS`, and index of the teammate in each of N episodes.
+        keys: key of each episode.
+        field: field of `Rollout` to return.
+
+    Returns:
+        State records before each step, uint8 (100, N, S), or rewards, float32 (100, N). Records are those of
+        `padded_layout` if all teammates see a `Situation`.
     """
-    each = teammates * episodes
-    total = len(REFERENCE_EGOS) * each  # environments are ordered by ego, teammate and episode
-    mate_of = np.arange(total) // episodes % teammates
-    starts = jax.random.split(jax.random.key(_SEED), episodes)
+    families = list(stacked_families(teammates))
+    # Policies that see observations or state records of one layout need the layout without padding.
+    every = all(family.sees == "situation" for _, family in families)
+    tables, expert, _ = (padded_layout if every else unpadded_layout)(layout)
+    play = _compile(
+        tuple((tuple(numbers), family._replace(params=())) for numbers, family in families), tuple(pairs), field
+    )
+    return play(tables, expert, [family.params for _, family in families], keys)
+
+
+@lru_cache(maxsize=16)
+def _compile(
+    families: tuple[tuple[tuple[int, ...], Policy], ...], pairs: tuple[tuple[str, int], ...], field: str
+) -> Callable[..., Array]:
+    """Return a compiled function of the layout's tables, the parameters of the oracle and of each family, and keys."""
+    ego_of, mate_of = (np.array(column) for column in zip(*pairs, strict=True))
 
     @jax.jit
-    def play(tables: Tables, expert: Any, params: Sequence[Any]) -> Array:
+    def play(tables: Tables, expert: Any, params: Sequence[Any], keys: Key[Array, " N"]) -> Array:
         env = Environment(tables, KEPT_STEPS)
-        players = [
-            policy_player(env, ego, expert if name == "oracle" else (), EGO, total, only=k * each + np.arange(each))
-            for k, (name, ego) in enumerate(REFERENCE_EGOS.items())
-        ]
+        players = []
+        for name in np.unique(ego_of):
+            own = expert if name == "oracle" else ()
+            envs = np.flatnonzero(ego_of == name)
+            players.append(policy_player(env, REFERENCE_EGOS[name], own, EGO, len(pairs), only=envs))
         for (numbers, family), all_params in zip(families, params, strict=True):
             envs = np.flatnonzero(np.isin(mate_of, numbers))
             rows = np.searchsorted(numbers, mate_of[envs])
             own = jax.tree.map(lambda leaf, rows=rows: leaf[rows], all_params)
-            players.append(policy_player(env, family, own, TEAMMATE, total, own_params=True, only=envs))
-        carry = init_rollout(env, players, jnp.tile(starts, total // episodes))
-        return roll_out(env, players, carry, env.max_steps, starts[0])[1].reward.sum(axis=0)
+            players.append(policy_player(env, family, own, TEAMMATE, len(pairs), own_params=True, only=envs))
+        carry = init_rollout(env, players, keys)
+        return getattr(roll_out(env, players, carry, env.max_steps, keys[0])[1], field)
 
     return play
 

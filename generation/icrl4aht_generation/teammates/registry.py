@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,11 @@ _JITTER = 0.2
 """Maximum distance of a sampled parameter from its preset, as a share of the parameter's full range."""
 
 
+def heuristic_entry(family: str, theta_id: int, base_seed: int, theta: dict[str, Any]) -> dict[str, Any]:
+    """Return the teammate entry of a heuristic with the given values of all parameters."""
+    return {"kind": "heuristic", "family": family, "theta_id": theta_id, "base_seed": base_seed, "theta": theta}
+
+
 def heuristic_teammate(family: str, preset: str, theta_id: int) -> dict[str, Any]:
     """Return the teammate entry of a heuristic's preset, with explicit values of all parameters.
 
@@ -42,8 +48,7 @@ def heuristic_teammate(family: str, preset: str, theta_id: int) -> dict[str, Any
     """
     heuristic = _family(family)
     check_choice(f"preset of {family}", preset, heuristic.presets)
-    theta = heuristic.defaults | heuristic.presets[preset]
-    return {"kind": "heuristic", "family": family, "theta_id": theta_id, "base_seed": 0, "theta": theta}
+    return heuristic_entry(family, theta_id, 0, heuristic.defaults | heuristic.presets[preset])
 
 
 def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) -> dict[str, Any]:
@@ -64,13 +69,18 @@ def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) 
     Raises:
         UnknownNameError: if the family or the split does not exist.
     """
-    heuristic = _family(family)
+    theta = _sampled_theta(_family(family), split, f"{family}:{theta_id}:{split}:{base_seed}")
+    return heuristic_entry(family, theta_id, base_seed, dict(theta))
+
+
+@cache  # profiles and tables sample the same teammates many times
+def _sampled_theta(heuristic: Heuristic, split: str, seed: str) -> dict[str, float]:
     samplings = {"train": heuristic.train, "test": heuristic.test}
     samplings |= {"diverse": heuristic.diverse} if heuristic.diverse else {}
     check_choice("split", split, samplings)
     presets, ranges = samplings[split]
     # A SHA-256 hash as seed depends neither on the order of calls nor on Python's salted hashes.
-    digest = hashlib.sha256(f"{family}:{theta_id}:{split}:{base_seed}".encode()).hexdigest()
+    digest = hashlib.sha256(seed.encode()).hexdigest()
     key, own = jax.random.split(jax.random.key(int(digest[:8], 16)))
     theta = heuristic.defaults | heuristic.presets[presets[_randint(own, len(presets))]]
     for name, value in theta.items():
@@ -85,7 +95,7 @@ def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) 
             theta[name] = _uniform(own, max(value - distance, low), min(value + distance, high))
         elif isinstance(value, float):
             theta[name] = float(np.float32(value))
-    return {"kind": "heuristic", "family": family, "theta_id": theta_id, "base_seed": base_seed, "theta": theta}
+    return theta
 
 
 def _randint(key: jax.Array, n: int) -> int:

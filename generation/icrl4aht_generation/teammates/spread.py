@@ -32,7 +32,7 @@ from icrl4aht_generation.teammates.heuristics.territory import (
     LAZY,
     STATIONS,
 )
-from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
+from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, heuristic_entry, sample_teammate
 
 SPREAD_TABLE = Path(__file__).with_name("spread.jsonl")
 """Path of the table of the chosen teammates."""
@@ -131,7 +131,7 @@ class SpreadTeammate(Struct, forbid_unknown_fields=True):
     @property
     def entry(self) -> dict[str, Any]:
         """Entry of the teammate in a task."""
-        return _entry(self.family, self.theta_id, dict(self.theta))
+        return heuristic_entry(self.family, self.theta_id, SPREAD_SEED, dict(self.theta))
 
 
 class LayoutSpread(Struct, forbid_unknown_fields=True):
@@ -221,8 +221,7 @@ def find_measured(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
 
 @lru_cache(maxsize=1)
 def _bundled_spreads() -> dict[str, LayoutSpread]:
-    table = read_measured(SPREAD_TABLE, LayoutSpread) if SPREAD_TABLE.is_file() else []
-    return {spread.layout: spread for spread in table}
+    return {spread.layout: spread for spread in read_measured(SPREAD_TABLE, LayoutSpread)}
 
 
 def spread_rows(spreads: Iterable[LayoutSpread]) -> list[dict[str, Any]]:
@@ -265,11 +264,8 @@ def _family_candidates(family: str) -> Iterator[dict[str, Any]]:
         if RANDOM_ACTIONS not in theta
     ]
     for first, thetas in ((0, fixed), (_FIRST_DRAW, drawn), (_FIRST_MIXTURE, mixed)):
-        yield from (_entry(family, number, theta) for number, theta in enumerate(thetas, start=first))
-
-
-def _entry(family: str, theta_id: int, theta: dict[str, Any]) -> dict[str, Any]:
-    return {"kind": "heuristic", "family": family, "theta_id": theta_id, "base_seed": SPREAD_SEED, "theta": theta}
+        for number, theta in enumerate(thetas, start=first):
+            yield heuristic_entry(family, number, SPREAD_SEED, theta)
 
 
 def choose_spread(distances: np.ndarray, least: float, most: int) -> tuple[list[int], list[float]]:

@@ -45,7 +45,13 @@ def models(run, tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def test_bundling_copies_parameters_and_training_record_of_the_run(run, models):
+def test_bundled_model_has_name_parameters_and_training_record_of_the_run(run, models):
+    agent = find_agent("ad-tiny")
+    assert agent.details and agent.name == agent.details["model"] == "ad-tiny"
+    assert agent.details["trained_on"] == {"teammate": read_trained(run).trained_on}
+    message = "ad-tiny: no model for layout cramped_down of track layout, only for tracks teammate: choose tasks"
+    with pytest.raises(OptionError, match=message):
+        agent.make(get_layout("cramped_down"))
     one, two = read_trained(run), read_trained(models / "ad-tiny" / "teammate")
     jax.tree.map(np.testing.assert_array_equal, one.params, two.params)
     assert (one.step, one.context, one.layouts, one.trained_on) == (two.step, two.context, two.layouts, two.trained_on)
@@ -53,12 +59,6 @@ def test_bundling_copies_parameters_and_training_record_of_the_run(run, models):
     assert json.loads(text)["histories"]["root"] == "mini" and str(Path.home()) not in text
     with Image.open(run / "curves.png") as drawn, Image.open(models / "ad-tiny" / "teammate" / "curves.png") as copied:
         assert copied.size == drawn.size and copied.mode == "P"
-
-
-def test_bundled_model_reports_its_name_and_training_record(run, models):
-    agent = find_agent("ad-tiny")
-    assert agent.details and agent.name == agent.details["model"] == "ad-tiny"
-    assert agent.details["trained_on"] == {"teammate": read_trained(run).trained_on}
 
 
 def test_model_bundled_with_sampled_actions_draws_actions_by_default(run, tmp_path, monkeypatch):
@@ -75,13 +75,7 @@ def test_model_bundled_with_sampled_actions_draws_actions_by_default(run, tmp_pa
         find_agent(run, acting="exat")  # type: ignore[arg-type]
 
 
-def test_layout_of_a_track_without_bundled_model_raises_error(models):
-    message = "ad-tiny: no model for layout cramped_down of track layout, only for tracks teammate: choose tasks"
-    with pytest.raises(OptionError, match=message):
-        find_agent("ad-tiny").make(get_layout("cramped_down"))
-
-
-def test_bundling_rejects_invalid_names_and_unfinished_runs(run, tmp_path):
+def test_bundling_rejects_invalid_names_unfinished_runs_and_large_models(run, tmp_path, monkeypatch):
     for name in ("../ad", "oracle", "AD-x", ""):
         with pytest.raises(OptionError, match="expected words of small letters and digits with hyphens: ad-reference"):
             bundle_run(run, name, "teammate", tmp_path)
@@ -91,14 +85,10 @@ def test_bundling_rejects_invalid_names_and_unfinished_runs(run, tmp_path):
     (half / "config.json").write_text(json.dumps(config | {"train": config["train"] | {"steps": 9}}))
     with pytest.raises(OptionError, match="half: stopped at step 1 of 9; resume training with the same command"):
         bundle_run(half, "ad-tiny", "teammate", tmp_path / "models")
-    assert not (tmp_path / "models").exists()
-
-
-def test_bundling_rejects_large_models(run, tmp_path, monkeypatch):
     monkeypatch.setattr(bundled, "_LARGEST", 1000)
     with pytest.raises(OptionError, match=r"parameters of [\d,]+ bytes, expected at most 1,000: bundle a smaller"):
-        bundle_run(run, "ad-tiny", "teammate", tmp_path)
-    assert not list(tmp_path.iterdir())
+        bundle_run(run, "ad-tiny", "teammate", tmp_path / "models")
+    assert not (tmp_path / "models").exists()
 
 
 def test_models_of_the_package_are_small_have_cards_and_load():
@@ -112,10 +102,8 @@ def test_models_of_the_package_are_small_have_cards_and_load():
         for track, folder in model.runs.items():
             size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
             assert size < 2.1e6, folder
-            trained = read_trained(folder)
             for layout in {"teammate": ("demo_wide", "coord_ring"), "layout": ("asymm_right", "cramped_down")}[track]:
-                policy = agent.make(get_layout(layout))
-                assert policy.sees == "canonical_input" and trained.channels == "canonical"
+                assert agent.make(get_layout(layout)).sees == "canonical_input"
 
 
 def test_training_rejects_initial_parameters_of_another_model_size(run, tmp_path):

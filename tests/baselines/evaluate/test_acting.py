@@ -1,4 +1,4 @@
-"""Evaluation of trained models, and the commands `train` and `evaluate`."""
+"""Evaluation of trained models."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
-from icrl4aht_baselines.methods.options import SIZES, ModelOptions, ModelSize
+from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, format_versions, open_run
@@ -20,10 +20,8 @@ from icrl4aht_generation.learners.resume import Checkpoints
 from icrl4aht_generation.teammates.instances import published_tasks
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import file_hash
 from tests.helpers.commands import run_cli
 from tests.helpers.small_models import random_parameters
-from tests.servers.http import http_server
 
 SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=2, steps=10)
 WIDE = [task for task in published_tasks("teammate") if (task.layout.name, task.teammate_family) == ("demo_wide", "H4")]
@@ -81,29 +79,3 @@ class TestBadRuns:
         shutil.rmtree(Path(copy("early")) / "checkpoints")
         with pytest.raises(OptionError, match="no checkpoint yet; continue the training"):
             find_agent(str(tmp_path / "early"))
-
-
-@pytest.mark.slow
-def test_train_command_records_settings_and_data(lite, tmp_path, monkeypatch):
-    """The release with the training data is read over HTTP."""
-    monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 16, 5, heads=2, encoder="words"))
-    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
-    small = ["--steps", "1", "--batch-size", "2", "--context", "4"]
-    with http_server(lite[0]) as server:
-        arguments = ["train", "ad", "--layout", "demo_wide", "--root", server.url, "--out", str(tmp_path / "run")]
-        printed = run_cli(*arguments, *small)
-        assert "1 step in" in printed
-        with pytest.raises(OptionError, match=r"model\.teammate_actions: it has False, expected True"):
-            run_cli(*arguments, *small, "--ta")
-    config = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert config["model"].items() >= {"layers": 1, "width": 16, "heads": 2, "encoder": "words"}.items()
-    assert (config["train"]["steps"], config["train"]["batch_size"]) == (1, 2)
-    assert "size tiny, the default on a CPU: layers 1, width 16, encoder words" in printed
-    assert "K = 4, steps 1, batch size 2" in printed
-    assert config["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
-    (cell,) = config["trained_on"]
-    named = {"layout": "demo_wide", "split": "train", "family": "H4", "algorithm": "utility_greedy", "source": "ppo"}
-    assert cell.items() >= (named | {"tasks": 1, "histories": 2}).items()
-    assert config["histories"]["data_version"] == "0.0.1"
-    assert config["histories"]["root"] == server.url
-    assert config["histories"]["manifest_sha256"] == file_hash(lite[0] / "MANIFEST.sha256")

@@ -26,6 +26,7 @@ from icrl4aht_data.benchmark.tasks import make_task, write_tasks
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.actions import STAY
 from tests.helpers.commands import run_cli
+from tests.helpers.host_agents import HostRecorder
 
 H1, H2, H4 = (published_task("coord_simple", f"{family}/t0") for family in ("H1", "H2", "H4"))
 TASKS = [H1, H4]
@@ -152,29 +153,13 @@ def test_stored_control_results_are_reused_only_for_same_partners(programs, tmp_
         evaluate("mine", forbidden, [H4, H2, H1], FOUR, control="swapped", out=tmp_path / "swapped", details={"of": 1})
 
 
-class Recorder:
-    """A host agent that always stays; it records its resets and its inputs in the first step of each episode."""
-
-    def __init__(self):
-        self.log: list[list] = []
-
-    def reset(self, batch):
-        self.log.append([])
-        self.step = 0
-
-    def act(self, ego_input):
-        if self.step % 5 == 0:
-            self.log[-1].append(ego_input)
-        self.step += 1
-        return np.full(len(ego_input.obs), STAY)
-
-
 def test_memory_control_resets_host_agents_before_each_episode(tmp_path):
-    agent, short = Recorder(), dataclasses.replace(FOUR, steps=5)
+    agent, short = HostRecorder(), dataclasses.replace(FOUR, steps=5)
     evaluate_controls("host", from_host(agent), TASKS, short)
+    log = [inputs[::5] for inputs in agent.seen]  # inputs in the first step of each episode, after each reset
     # Both families: one reset without a control, four resets with memory cleared, one reset with swapped teammates.
-    assert [len(episodes) for episodes in agent.log] == [4, 4] + [1] * 8 + [4, 4]
-    plain, cleared, swapped = agent.log[0], [episodes[0] for episodes in agent.log[2:6]], agent.log[10]
+    assert [len(episodes) for episodes in log] == [4, 4] + [1] * 8 + [4, 4]
+    plain, cleared, swapped = log[0], [episodes[0] for episodes in log[2:6]], log[10]
     assert [bool(one.prev_done) for one in plain] == [False, True, True, True]
     assert not any(one.prev_done or one.prev_action for one in cleared)
     assert [bool(one.prev_done) for one in swapped] == [False, True, True, True]

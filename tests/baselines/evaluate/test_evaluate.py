@@ -26,12 +26,11 @@ from icrl4aht_generation.teammates.instances import published_tasks
 
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_headroom
-from icrl4aht_data.benchmark.tasks import write_tasks
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.rules import step
-from tests.helpers.commands import run_cli
+from tests.helpers.host_agents import HostRecorder
 
 PUBLISHED = dataclasses.replace(PROTOCOLS["published"], episodes=4)
 ALL = [task for track in TRACKS for task in published_tasks(track)]
@@ -59,19 +58,28 @@ def test_returns_of_a_task_do_not_depend_on_other_tasks_in_batch(batch_returns):
 
 def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_returns, tmp_path):
     first = evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
-    started = []
+    started, played = [], []
 
     def watched(layout):
         started.append(layout.name)
         return random(layout)
 
-    played: list[int] = []
     again = evaluate("random", watched, SIMPLE + RING, PUBLISHED, out=tmp_path, played=played.append)
     assert returns(again) == batch_returns
     assert played == [5 * 4, 5, 5, 5, 5]  # stored tasks are reported in one call, other tasks after each episode
     assert started == ["coord_ring"]
     assert len(list((tmp_path / "tasks").iterdir())) == 10
-    assert read_result(tmp_path / "tasks" / f"{SIMPLE[0].task_id}.json") == first[0]
+    path = tmp_path / "tasks" / f"{SIMPLE[0].task_id}.json"
+    assert read_result(path) == first[0]
+    for agent, seeds in (("random", [1]), ("stay", [0])):
+        with pytest.raises(OptionError, match="holds a result of other settings"):
+            evaluate(agent, random, SIMPLE, PUBLISHED, seeds=seeds, out=tmp_path)
+    content = json.loads(path.read_text())
+    content["settings"]["seeds"] = [5]
+    for text, message in ((json.dumps(content), "do not match their hash"), ("{", "not a result")):
+        path.write_text(text)
+        with pytest.raises(OptionError, match=message):
+            read_run(tmp_path)
 
 
 def test_seeds_and_tasks_give_different_returns(batch_returns):
@@ -80,14 +88,6 @@ def test_seeds_and_tasks_give_different_returns(batch_returns):
     assert all(both[task.task_id][1:] == batch_returns[task.task_id] for task in SIMPLE)
     assert any(both[task.task_id][0] != batch_returns[task.task_id][0] for task in SIMPLE)
     assert len({tuple(batch_returns[task.task_id][0]) for task in SIMPLE}) > 1
-
-
-def test_folder_with_results_of_other_settings_raises_error(tmp_path):
-    evaluate("stay", stay, SIMPLE, PUBLISHED, out=tmp_path)
-    with pytest.raises(OptionError, match="holds a result of other settings"):
-        evaluate("stay", stay, SIMPLE, PUBLISHED, seeds=[1], out=tmp_path)
-    with pytest.raises(OptionError, match="holds a result of other settings"):
-        evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
 
 
 def test_output_folder_with_other_files_raises_error(tmp_path):
@@ -117,70 +117,35 @@ def test_invalid_arguments_of_evaluate_raise_errors(arguments, message):
         from_host(5)  # type: ignore[arg-type]
 
 
-def test_damaged_result_file_raises_error(tmp_path):
-    evaluate("stay", stay, SIMPLE, PUBLISHED, out=tmp_path)
-    path = min((tmp_path / "tasks").iterdir())
-    content = json.loads(path.read_text())
-    content["settings"]["seeds"] = [5]
-    path.write_text(json.dumps(content))
-    with pytest.raises(OptionError, match="do not match their hash"):
-        read_run(tmp_path)
-    path.write_text("{")
-    with pytest.raises(OptionError, match="not a result"):
-        read_run(tmp_path)
-
-
-class RecordingAgent:
-    """A host agent that plays given or random actions and records its inputs."""
-
-    def __init__(self, actions=None):
-        self.actions = actions
-        self.seen: list[EgoInput] = []
-
-    def reset(self, batch):
-        self.batch, self.rng, self.played = batch, np.random.default_rng(0), []
-
-    def act(self, ego_input):
-        self.seen.append(ego_input)
-        chosen = self.rng.integers(0, 6, self.batch) if self.actions is None else self.actions(self.batch)
-        self.played.append(chosen)
-        return chosen
-
-
-def test_host_agents_receive_observations_and_rewards():
-    watcher = RecordingAgent()
-    protocol = dataclasses.replace(PUBLISHED, episodes=2)
-    played = list(play_tasks(from_host(watcher), SIMPLE, protocol))
-    record, actions, reward = (np.concatenate([np.asarray(p[k]) for p in played], axis=1) for k in range(3))
-    assert len(watcher.seen) == 200
-    assert all(part.flags.writeable for part in watcher.seen[0]), "torch.from_numpy takes them without a warning"
-    layout = LAYOUTS["coord_simple"]
-    for t, ego_input in enumerate(watcher.seen):
+def test_host_agents_receive_observations_and_rewards_that_follow_the_rules():
+    rng = np.random.default_rng(0)
+    watcher = HostRecorder(lambda batch: rng.integers(0, 6, batch))
+    episodes = list(play_tasks(from_host(watcher), RING, dataclasses.replace(PUBLISHED, episodes=2)))
+    record, actions, reward = (np.concatenate([np.asarray(p[k]) for p in episodes], axis=1) for k in range(3))
+    (seen,), (played,) = watcher.seen, watcher.played
+    assert len(seen) == 200
+    assert all(part.flags.writeable for part in seen[0]), "torch.from_numpy takes them without a warning"
+    layout = LAYOUTS["coord_ring"]
+    for t, ego_input in enumerate(seen):
         np.testing.assert_array_equal(ego_input.obs, observe(layout, record[:, t], 0))
-        np.testing.assert_array_equal(watcher.played[t], actions[:, t, 0])
+        np.testing.assert_array_equal(played[t], actions[:, t, 0])
         if t:
             np.testing.assert_array_equal(ego_input.prev_action, actions[:, t - 1, 0])
             np.testing.assert_array_equal(ego_input.prev_teammate_action, actions[:, t - 1, 1])
             np.testing.assert_array_equal(ego_input.prev_reward, reward[:, t - 1])
         assert ego_input.prev_done.tolist() == [t == 100] * 5
-    assert not watcher.seen[0].prev_action.any()
-    assert not watcher.seen[0].prev_reward.any()
-
-
-def test_states_and_rewards_of_played_episodes_follow_the_rules():
-    protocol = dataclasses.replace(PUBLISHED, episodes=1)
-    (played,) = play_tasks(random, RING, protocol, [3])
-    record, actions = np.asarray(played.record), np.asarray(played.actions)
-    layout = LAYOUTS["coord_ring"]
-    outcome = step(layout, record[:, :-1], actions[:, :-1], record[:, 1:, 6])
-    np.testing.assert_array_equal(outcome.state, record[:, 1:])
-    np.testing.assert_array_equal(outcome.reward, played.reward[:, :-1])
+    assert not seen[0].prev_action.any() and not seen[0].prev_reward.any()
+    for episode in np.split(np.arange(200), 2):
+        before, after = episode[:-1], episode[1:]
+        outcome = step(layout, record[:, before], actions[:, before], record[:, after, 6])
+        np.testing.assert_array_equal(outcome.state, record[:, after])
+        np.testing.assert_array_equal(outcome.reward, reward[:, before])
 
 
 def test_out_of_range_action_of_host_agent_raises_error():
-    watcher = RecordingAgent(lambda batch: np.full(batch, 6))
+    make_ego = from_host(HostRecorder(lambda batch: np.full(batch, 6)))
     with pytest.raises(OptionError, match=r"returned actions 6\.\.6 on coord_simple, expected 0\.\.5"):
-        evaluate("mine", from_host(watcher), SIMPLE, dataclasses.replace(PUBLISHED, episodes=1))
+        evaluate("mine", make_ego, SIMPLE, dataclasses.replace(PUBLISHED, episodes=1))
 
 
 @pytest.mark.parametrize(
@@ -192,7 +157,7 @@ def test_out_of_range_action_of_host_agent_raises_error():
 )
 def test_host_agent_actions_of_wrong_shape_or_type_raise_errors(actions, message):
     """Only the policy is called, since compiling the environment's step takes seconds."""
-    policy, keys = from_host(RecordingAgent(lambda batch: actions))(LAYOUTS["coord_simple"]), jnp.zeros(1, jnp.uint32)
+    policy, keys = from_host(HostRecorder(lambda batch: actions))(LAYOUTS["coord_simple"]), jnp.zeros(1, jnp.uint32)
     ego_input = EgoInput(jnp.zeros((1, 5, 5, 40)), *[jnp.zeros(1)] * 4)
     memory = policy.init((), keys)
     with pytest.raises(jax.errors.JaxRuntimeError, match=message):
@@ -206,21 +171,6 @@ def test_jax_agent_action_of_wrong_shape_or_type_raises_error(action):
 
     with pytest.raises(OptionError, match=r"expected one integer 0\.\.5 for each"):
         evaluate("mine", make_ego, SIMPLE, PUBLISHED)
-
-
-def test_ego_memory_is_kept_between_episodes_of_a_task():
-    """An ego that counts its steps plays `stay` in the first episode and `interact` in the second."""
-
-    def make_ego(layout):
-        def act(params, count, view, key):
-            return jnp.where(count < 100, 4, 5), count + 1  # 4 is `stay`, 5 is `interact`
-
-        return Policy((), lambda params, key: jnp.int32(0), act, "observation")
-
-    protocol = dataclasses.replace(PUBLISHED, episodes=2)
-    first, second = play_tasks(make_ego, SIMPLE, protocol)
-    assert (first.actions[..., 0] == 4).all()
-    assert (second.actions[..., 0] == 5).all()
 
 
 def test_invalid_teammate_raises_error_before_evaluation_starts(tmp_path):
@@ -249,25 +199,6 @@ def test_note_names_layouts_that_hide_the_recipe_from_the_ego():
     assert " on asymm_right: " in note and "throughout" not in note
     preference = hidden_recipe_note(bundled_tasks("preference", "validation"))
     assert "asymm_both_plain, test_wide_plain, rooms-0-46" in preference and "throughout" in preference
-
-
-def test_evaluate_and_report_commands_write_results_and_tables(tmp_path):
-    write_tasks(tmp_path / "two.jsonl", SIMPLE[:2])
-    options = ["--protocol", "published", "--manifest", str(tmp_path / "two.jsonl"), "--out", str(tmp_path / "run")]
-    options += ["--tasks", "1", "--episodes", "4"]
-    printed = run_cli("evaluate", "--agent", "stay", *options)
-    assert f"1 result in {tmp_path / 'run'}, 1 program compiled" in printed
-    (path,) = (tmp_path / "run" / "tasks").iterdir()
-    assert read_result(path).returns == [[40.0] * 4]
-    printed = run_cli("report", tmp_path / "run")
-    assert "| H4 | stay | 40.0<br>1 of 5 instances<br>episodes 1: 40.0, 2-5: 40.0<br>no headroom |" in printed
-    assert {path.name for path in (tmp_path / "run" / "report").iterdir()} == {"report.md", "report.csv"}
-    with pytest.raises(OptionError, match="report: exists"):
-        run_cli("report", tmp_path / "run")
-    run_cli("report", tmp_path / "run", "--overwrite")
-    (tmp_path / "two.jsonl").write_text("{}\n")
-    with pytest.raises(TaskFormatError, match="line 1"):
-        run_cli("evaluate", "--agent", "stay", *options)
 
 
 def test_headroom_is_stored_for_every_layout_and_family_of_test_tasks():

@@ -1,4 +1,4 @@
-"""Evaluation with learned teammates that a suite of teammates holds out of training."""
+"""The commands `train`, `evaluate` and `report`, with learned teammates that a suite holds out of training."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 import pytest
+from icrl4aht_baselines.methods.options import SIZES, ModelSize
 from icrl4aht_baselines.report.gifs import family_gifs
 from icrl4aht_baselines.report.results import read_run
 from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS, save_policy
@@ -17,10 +18,12 @@ from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.network import ActorCritic
 
 from icrl4aht_data.benchmark.tasks import make_task, write_tasks
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import file_hash
 from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import random_release
+from tests.servers.http import http_server
 
 
 @pytest.fixture
@@ -38,11 +41,28 @@ def suite(tmp_path) -> Path:
 
 
 @pytest.mark.slow
-def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, tmp_path):
+def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, tmp_path, monkeypatch):
+    """The release with the training data is read over HTTP."""
     release, trained, results = tmp_path / "release", tmp_path / "run", tmp_path / "results"
-    random_release(release, layouts=("cramped_up",), teammates=1, streams=2, episodes=2)
-    small = "--steps 1 --context 8 --batch-size 2 --validation-batches 1 --layers 1 --width 8 --heads 2 --ta --next-obs"
-    run_cli(f"train dpt --root {release} --layout cramped_up {small} --out {trained}")
+    random_release(release, layouts=("cramped_up",))
+    monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 8, 5, heads=2, encoder="mlp"))
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
+    with http_server(release) as server:
+        small = "--steps 1 --context 8 --batch-size 2 --validation-batches 1 --next-obs"
+        train = f"train dpt --root {server.url} --layout cramped_up {small} --out {trained}"
+        printed = run_cli(f"{train} --ta")
+        with pytest.raises(OptionError, match=r"model\.teammate_actions: it has True, expected False"):
+            run_cli(train)
+    assert "size tiny, the default on a CPU: layers 1, width 8, encoder mlp" in printed
+    assert "K = 8, steps 1, batch size 2" in printed and "1 step in" in printed
+    config = json.loads((trained / "config.json").read_text())
+    assert config["model"].items() >= {"layers": 1, "width": 8, "heads": 2, "encoder": "mlp"}.items()
+    assert (config["train"]["steps"], config["train"]["batch_size"]) == (1, 2)
+    assert config["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
+    assert (config["histories"]["data_version"], config["histories"]["root"]) == ("0.0.1", server.url)
+    (cell,) = config["trained_on"]
+    named = {"layout": "cramped_up", "split": "train", "family": "H4", "algorithm": "utility_greedy", "source": "ppo"}
+    assert cell.items() >= (named | {"tasks": 1, "histories": 2}).items()
     losses = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
     assert {"prior_accuracy", "next_obs_loss"} <= losses[-1].keys()
     run_cli(
@@ -65,7 +85,6 @@ def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, 
     assert page.count("data:image/gif") == 2
 
     other = shutil.copytree(trained, tmp_path / "other")
-    config = json.loads((other / "config.json").read_text())
     (other / "config.json").write_text(json.dumps(config | {"package_version": "0.0.0"}))
     (results / "run.json").write_text(json.dumps(about | {"run": str(other)}))
     (pair,) = family_gifs([read_run(results)], tmp_path, suite)

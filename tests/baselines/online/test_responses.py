@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
-from icrl4aht_baselines.evaluate.protocols import bundled_tasks
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.protocols import test_tasks as tasks_of
-from icrl4aht_baselines.online import responses
+from icrl4aht_baselines.online import adaptation, responses
 from icrl4aht_baselines.online.adaptation import HeadroomJob, adaptation_table, headroom_jobs, write_adaptation
 from icrl4aht_baselines.online.responses import ResponseJob, ResponseOptions
+from icrl4aht_baselines.training import trainer
+from icrl4aht_generation.teammates.distances import common_records
 
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.errors import OptionError
@@ -33,8 +36,9 @@ def test_with_headroom_drops_tasks_on_which_the_oracle_gains_little():
 
 
 @pytest.mark.slow
-def test_teammates_with_the_same_behaviour_share_a_best_response():
-    """On test_wide, the five H4 teammates behave the same, and the five H3 teammates differ."""
+def test_teammates_with_the_same_behaviour_share_a_best_response(monkeypatch):
+    """On test_wide, the five H4 teammates behave the same, and the five H3 teammates differ, also in few episodes."""
+    monkeypatch.setattr(responses, "common_states", cache(lambda layout: (common_records(layout, 1), None)))
     tasks = [task for family in ("H3", "H4") for task in tasks_of("teammate", "test_wide", family)]
     assert [len(alike) for alike in responses.find_behaviours(tasks)] == [1] * 5 + [5]
 
@@ -106,8 +110,11 @@ def test_headroom_job_with_fewer_tasks_than_needed_raises_error(tmp_path):
 
 
 @pytest.mark.slow
-def test_tiny_best_response_and_headroom_jobs_finish(tmp_path):
+def test_tiny_best_response_and_headroom_jobs_finish(tmp_path, monkeypatch):
     """Train a best response for one task, and both egos of the headroom on two layouts; repeated calls do nothing."""
+    monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded", 2))
+    monkeypatch.setattr(adaptation, "MEASURED_EPISODES", 2)
+    monkeypatch.setattr(trainer, "can_draw", lambda: False)
     job = ResponseJob((DEMO[0],), 0, TINY, tmp_path)
     calls = []
     job.run(lambda updates, speed: calls.append(updates))
@@ -121,5 +128,5 @@ def test_tiny_best_response_and_headroom_jobs_finish(tmp_path):
     tasks = {"all": [DEMO[5], *tasks_of("teammate", "test_wide", "H1")[:1]]}
     for other in headroom_jobs(tasks, 1, TINY, tmp_path):
         other.run()
-        assert set(other.returns()) == {task.task_id for task in tasks["all"]}
+        assert set(other.result()["returns"]) == {task.task_id for task in tasks["all"]}
     assert "| all |" in adaptation_table(write_adaptation(headroom_jobs(tasks, 1, TINY, tmp_path), tmp_path).parent)

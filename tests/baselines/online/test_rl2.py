@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from icrl4aht_baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
     PlayTrainer,
     TaskGroup,
-    chosen_teammates,
     make_groups,
     make_players,
     seen_steps,
@@ -47,6 +45,7 @@ from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import start_record
 from tests.helpers.commands import run_cli
+from tests.helpers.spoiled import read_lines
 
 LAYOUT = get_layout("cramped_up")
 MODEL = ModelOptions(width=16, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05)
@@ -70,8 +69,8 @@ def trainer() -> PlayTrainer:
 @pytest.fixture(scope="module")
 def episode(trainer) -> Any:
     """Return the trainer's compiled function that plays one episode."""
-    trainer._compiled = trainer._compile(trainer.init(), jax.random.key(0))
-    return trainer._compiled[0]
+    state = trainer.init()
+    return trainer.programs(state.params, state.tasks)[0]
 
 
 @pytest.fixture(scope="module")
@@ -89,21 +88,23 @@ def test_sequence_outputs_equal_step_by_step_outputs():
         jnp.asarray(rng.choice([-20.0, 0.0, 20.0], (6, 3))),
         jnp.asarray(rng.integers(6, size=(6, 3))),
     )
-    params = METHOD.init(jax.random.key(0))
-    start = jnp.zeros((3, 16))
-    apply, act = jax.jit(partial(METHOD.model.apply, {"params": params})), jax.jit(METHOD.act)
+    model = dataclasses.replace(MODEL, recurrent_layers=2)
+    method = get_method("rl2")(model, overcooked_world([LAYOUT], "mlp", canonical=True))
+    params, start = method.init(jax.random.key(0)), jnp.zeros((3, 32))
+    apply, act = jax.jit(partial(method.model.apply, {"params": params})), jax.jit(method.act)
     found: Any = apply(steps, start)
     output, end = found
     half, state = apply(jax.tree.map(lambda x: x[:3], steps), start)
     rest, last = apply(jax.tree.map(lambda x: x[3:], steps), state)
     np.testing.assert_allclose(output.logits, jnp.concatenate([half.logits, rest.logits]), atol=1e-5)
     np.testing.assert_allclose(np.asarray(end), np.asarray(last), atol=1e-5)
-    memory = METHOD.start(0, True)
+    memory = method.start(0, True)
     for t in range(6):
         logits, memory = act(params, jax.tree.map(lambda x, t=t: x[t, 1], steps), jnp.bool_(False), memory)
         np.testing.assert_allclose(logits, output.logits[t, 1], atol=1e-5)
+    np.testing.assert_allclose(np.asarray(end[1]), np.asarray(memory), atol=1e-5)
     with pytest.raises(TypeError, match="trained by playing"):
-        METHOD.loss(params, None, None, None)
+        method.loss(params, None, None, None)
 
 
 def test_training_sequences_match_the_played_episode(trainer, episode):
@@ -128,7 +129,7 @@ def test_training_sequences_match_the_played_episode(trainer, episode):
 
 
 def test_training_log_has_losses_and_falling_imitation_weight(full_run):
-    lines = [json.loads(line) for line in (full_run[0] / "metrics.jsonl").read_text().splitlines()]
+    lines = read_lines(full_run[0] / "metrics.jsonl")
     assert [line["step"] for line in lines] == list(range(1, 7))
     assert [line["imitation_weight"] for line in lines] == pytest.approx(1 - np.arange(6) / 6)
     assert {"return cramped_up assembly_line", "policy_loss", "value_loss", "entropy", "loss"} <= lines[0].keys()
@@ -137,7 +138,7 @@ def test_training_log_has_losses_and_falling_imitation_weight(full_run):
 def test_imitation_loss_makes_oracle_actions_likelier(trainer, episode):
     """On a fixed episode, only a positive imitation weight makes the oracle's actions likelier."""
     state = trainer.init()
-    _, played, _ = episode(state.params, trainer._mates[0], state.tasks[0], jax.random.key(0))
+    _, played, _ = episode(state.params, trainer.players[0].mates, state.tasks[0], jax.random.key(0))
     fallen = {}
     for weight in (0.0, 5.0):
         params, optimizer = jax.tree.map(jnp.copy, (state.params, state.optimizer))
@@ -173,13 +174,6 @@ def test_previous_actions_of_a_first_step_are_not_mirrored():
     seen = seen_steps(change, steps, jnp.array([False, True]))
     assert seen.prev_action.tolist() == [0, 1]
     assert seen.prev_teammate_action is not None and seen.prev_teammate_action.tolist() == [0, 1]
-    model = dataclasses.replace(MODEL, recurrent_layers=2)
-    method = get_method("rl2")(model, overcooked_world([LAYOUT], "mlp", canonical=True))
-    params, state = method.init(jax.random.key(0)), jnp.zeros((2, 32))
-    both: Any = jax.jit(method.model.apply)({"params": params}, jax.tree.map(lambda x: x[None], steps), state)
-    step, memory = jax.tree.map(lambda x: x[0], steps), method.start(0, True)
-    _, alone = jax.jit(method.act)(params, step, jnp.bool_(False), memory)
-    np.testing.assert_allclose(np.asarray(both[1][0]), np.asarray(alone), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -197,7 +191,7 @@ def test_batch_of_several_layouts_gives_results_of_single_layouts():
     )
     params, key = METHOD.init(jax.random.key(0)), jax.random.key(1)
     (after, found, returns), (alone_after, expected, alone_returns) = (
-        one.compiled(params, one.mates, one.start(key), key) for one in (player, alone)
+        jax.jit(one.episode)(params, one.mates, jax.jit(one.start)(key), key) for one in (player, alone)
     )
     np.testing.assert_array_equal(returns[1:], alone_returns[1:])
     np.testing.assert_array_equal(after.env.record[1:], alone_after.env.record[1:])
@@ -216,18 +210,18 @@ class TestGroups:
             ("demo_wide a", 8, True),
         ]
 
-    def test_every_teammate_is_played_with_several_behaviours(self):
-        group = make_groups({(LAYOUT, "a"): teammates(3)}, 60, {LAYOUT.name: 1.0})[0]
+    def test_teammates_are_chosen_nearly_equally_often_with_several_behaviours(self):
+        (eight,), (four,), (group,) = (
+            make_groups({(LAYOUT, "a"): teammates(mates)}, tasks, {LAYOUT.name: 1.0})
+            for mates, tasks in ((3, 8), (10, 4), (3, 60))
+        )
+        assert sorted(collections.Counter(eight.ids).values()) == [2, 3, 3]
+        assert len(set(four.ids)) == 4
         found: dict[bytes, set[bytes]] = {}
         for mate in group.teammates:
             theta = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(mate.params["script"]))
             found.setdefault(theta, set()).add(np.asarray(mate.params["chances"]).tobytes())
         assert all(len(behaviours) >= 3 for behaviours in found.values())
-
-    def test_teammates_are_chosen_nearly_equally_often(self):
-        assert sorted(np.bincount(chosen_teammates(3, 8)).tolist()) == [2, 3, 3]
-        few = chosen_teammates(10, 4)
-        assert len(set(few.tolist())) == 4 and few.max() < 10
 
     def test_fewer_tasks_than_minibatches_raise_error(self):
         groups = make_groups({(LAYOUT, "a"): teammates(1)}, 3, {LAYOUT.name: 1.0})
@@ -375,19 +369,18 @@ class TestPreparing:
             self.prepare(play, tasks, choice)
 
 
-class TestCommand:
-    @pytest.mark.slow
-    def test_train_command_writes_a_model_that_can_be_loaded(self, tmp_path):
-        out = tmp_path / "run"
-        choice = "--layout cramped_up --source noise --teammate-family H3 --hide-recipe cramped_up"
-        sizes = "--steps 1 --batch-size 2 --width 8 --epochs 1 --minibatches 1"
-        printed = run_cli(f"train rl2 {choice} {sizes} --out {out}")
-        assert "each an episode of 2 tasks" in printed
-        trained = read_trained(out)
-        assert (trained.label, trained.step, trained.channels) == ("RL2+TA+mlp", 1, "canonical")
-        assert {cell["labels"] for cell in trained.trained_on} == {"oracle"}
-        agent = find_agent(out, greedy=False)
-        assert agent.details and agent.details["sampled"] is True
-        assert trained.hide_recipe == ("cramped_up",)
-        task = published_task("cramped_down", "H1/t0")
-        prepare_rollout(agent.make, [task], get_protocol("seeded", 1))  # an unsuitable policy would raise an error
+@pytest.mark.slow
+def test_train_command_writes_a_model_that_can_be_loaded(tmp_path):
+    out = tmp_path / "run"
+    choice = "--layout cramped_up --source noise --teammate-family H3 --hide-recipe cramped_up"
+    sizes = "--steps 1 --batch-size 2 --width 8 --epochs 1 --minibatches 1"
+    printed = run_cli(f"train rl2 {choice} {sizes} --out {out}")
+    assert "each an episode of 2 tasks" in printed
+    trained = read_trained(out)
+    assert (trained.label, trained.step, trained.channels) == ("RL2+TA+mlp", 1, "canonical")
+    assert {cell["labels"] for cell in trained.trained_on} == {"oracle"}
+    agent = find_agent(out, greedy=False)
+    assert agent.details and agent.details["sampled"] is True
+    assert trained.hide_recipe == ("cramped_up",)
+    task = published_task("cramped_down", "H1/t0")
+    prepare_rollout(agent.make, [task], get_protocol("seeded", 1))  # an unsuitable policy would raise an error

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import gzip
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,6 +12,7 @@ from icrl4aht_baselines.report import comparison
 from icrl4aht_baselines.report.comparison import StoredResults
 from icrl4aht_baselines.report.scores import add_scales, cell_scales
 from icrl4aht_baselines.report.submission import AgentFacts, make_submission
+from msgspec import structs
 
 from icrl4aht_data.benchmark import best_responses
 from icrl4aht_data.benchmark.reference_returns import read_headroom
@@ -26,21 +26,16 @@ LOW, HIGH = [0.0] * 5 + [10.0] * 95, [10.0] * 5 + [20.0] * 95
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory) -> Path:
-    """Write results on the layout track of two agents: `high`, which needs its memory, and `low`."""
+def stored(tmp_path_factory) -> StoredResults:
+    """Return results on the layout track of two agents: `high`, which needs its memory, and `low`."""
     folder = tmp_path_factory.mktemp("results")
     write_results(folder / "high", "high", HIGH, offset=1.0)
     write_results(folder / "high" / "cleared", "high (cleared)", [5.0] * 100, offset=0.5, forget=True)
     write_results(folder / "high" / "swapped", "high (swapped)", HIGH[:80] + [20.0] * 20, offset=1.0, swapped=True)
     write_results(folder / "low", "low", LOW)
-    return folder
-
-
-@pytest.fixture
-def stored(folders) -> StoredResults:
     found = StoredResults()
     for name in ("high", "low"):
-        found = comparison.add_submission(found, make_submission([folders / name], FACTS))
+        found = comparison.add_submission(found, make_submission([folder / name], FACTS))
     return found
 
 
@@ -74,10 +69,11 @@ def test_agents_table_has_scores_of_complete_tracks_only(stored, invented_respon
 
 
 def test_lead_is_the_difference_of_the_two_highest_scores(tmp_path, invented_responses):
-    found = StoredResults()
+    one, found = make_submission([write_results(tmp_path, "a", [0.0] * 100, "teammate")], FACTS), StoredResults()
     for name, value in {"a": 3.0, "b": 9.0, "c": 5.0}.items():
-        folder = write_results(tmp_path / name, name, [value] * 100, track="teammate")
-        found = comparison.add_submission(found, make_submission([folder], FACTS))
+        returns = dict.fromkeys(one.evaluations[0].returns, [[value] * 100] * 3)
+        of_agent = structs.replace(one, agent=name, evaluations=[structs.replace(one.evaluations[0], returns=returns)])
+        found = comparison.add_submission(found, of_agent)
     lead = comparison.describe_lead(found.returns(), cell_scales("seeded"))
     assert "differ by +0.20 (+0.20 to +0.20): `b` minus `c`" in lead
 

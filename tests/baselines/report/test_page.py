@@ -10,7 +10,7 @@ from html.parser import HTMLParser
 
 import pytest
 from icrl4aht_baselines.agents.bundled import MODELS
-from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.headroom import write_headroom_cards
 from icrl4aht_baselines.reference import training_sentence
 from icrl4aht_baselines.report import gifs, merge
@@ -20,8 +20,8 @@ from icrl4aht_baselines.report.page import markdown, write_page, write_page_with
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, ResultCell
 
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.benchmark.tasks import make_task, write_tasks
+from icrl4aht_data.errors import OptionError, TaskFormatError
 from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 
@@ -78,7 +78,9 @@ def test_html_report_is_complete_and_loads_no_external_files(tmp_path):
 
 
 def test_html_in_names_is_escaped_in_all_reports(tmp_path):
-    run = trained(evaluated_run(EVIL, folder=EVIL), layers=2)
+    run = evaluated_run(EVIL, folder=EVIL)
+    source = run.sources[0]._replace(trained={"config": {"method": EVIL, "model": {EVIL: 2}}, "run_hash": "ab12"})
+    run = dataclasses.replace(run, sources=(source,))
     text = write_page([run], tmp_path / "report.html").read_text()
     assert Elements(text).outside == [] and EVIL not in text and EVIL in unescape(text)
     text = markdown([run])
@@ -140,15 +142,6 @@ def test_curves_share_axes_and_can_have_one_episode():
     assert curve_charts({0: one})[0].panels["demo_wide, H1"][0].line.count("L") == 1
 
 
-def trained(run: EvaluationRun, **model) -> EvaluationRun:
-    """Return the run with an added record of training on the run's layouts."""
-    histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": [*run.sources[0].layouts], "data_version": "1.0.0"}
-    histories |= {"sizes": {"train": 14}, "queries": 201, "every": 1, "labels": "oracle"}
-    config = {"method": "dpt", "model": model, "train": {"seed": 3}, "package_version": "0", "histories": histories}
-    content = {"config": config, "manifest_sha256": "ab12", "run_hash": json.dumps(config)}
-    return dataclasses.replace(run, sources=tuple(source._replace(trained=content) for source in run.sources))
-
-
 def test_model_cards_describe_the_training_data():
     """The card of each bundled model contains the training-data sentence that its configuration gives."""
     for name in ("ad-reference", "ad-rising", "dpt-reference", "rl2-reference"):
@@ -208,25 +201,36 @@ def test_restoring_an_unknown_or_missing_ego_raises_error(tmp_path):
         restore_ego(source._replace(trained={"run": str(tmp_path / "gone")}))
 
 
-def test_evaluate_and_report_commands_accept_a_custom_manifest(tmp_path, monkeypatch):
+def test_evaluate_and_report_commands_write_results_tables_and_page(tmp_path, monkeypatch):
     """The HTML report shows the first and last episode of each task with the stored returns."""
-    theta = next(task for task in TEST_TASKS if task.teammate_family == "H4").teammate
-    write_tasks(tmp_path / "own.jsonl", [make_task("teammate", "train", "demo_wide", theta | {"theta_id": 77}, 5)])
-    monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded").__class__("seeded", "seeded", False, 3, 5))
-    played = ["evaluate", "--agent", "stay", "--manifest", str(tmp_path / "own.jsonl"), "--out", str(tmp_path / "run")]
+    tests = [task for task in TEST_TASKS if (task.layout.name, task.teammate_family) == ("coord_simple", "H4")]
+    own = make_task("teammate", "train", "demo_wide", tests[0].teammate | {"theta_id": 77}, 5)
+    write_tasks(tmp_path / "tasks.jsonl", [*tests[:2], own])
+    monkeypatch.setitem(PROTOCOLS, "published", dataclasses.replace(PROTOCOLS["published"], steps=5))
+    options = ["--protocol", "published", "--manifest", tmp_path / "tasks.jsonl", "--tasks", "1", "--episodes", "3"]
+    played = ["evaluate", "--agent", "stay", *options, "--out", tmp_path / "run"]
+    printed = run_cli(*played)
     summary = (
-        "stay (seeded), 1 training cell: return 0.0; by episode 1: 0.0, 2-5: 0.0. No score: no best response measured."
+        "stay (published), 1 training cell: return 0.0; by episode 1: 0.0, 2-5: 0.0. No score: no best response "
+        "measured."
     )
-    assert summary in run_cli(*played)
-    arguments = ["report", str(tmp_path / "run"), "--html", str(tmp_path / "report.html")]
-    printed = run_cli(*arguments)
+    assert summary in printed and f"2 results in {tmp_path / 'run'}, 1 program compiled" in printed
+    printed = run_cli("report", tmp_path / "run", "--html", tmp_path / "report.html")
     assert f"* {summary}" in printed
+    assert "| H4 | stay | 0.0<br>1 of 5 instances<br>episodes 1: 0.0, 2-5: 0.0<br>no headroom |" in printed
+    assert {path.name for path in (tmp_path / "run" / "report").iterdir()} == {"report.md", "report.csv"}
     text = (tmp_path / "report.html").read_text()
-    assert Elements(text).images.count("data:image/gif") == 2
-    (task,) = read_tasks(tmp_path / "own.jsonl")
+    assert Elements(text).images.count("data:image/gif") == 4
     assert "<h4>stay with H4/t77 (training) on demo_wide</h4>" in text
-    assert f"Task {task.task_id}, protocol seeded, seed 0." in text
-    assert re.findall(r"<figcaption>(Episode [^<]+)<", text) == ["Episode 1: return 0", "Episode 3: return 0"]
+    assert f"Task {own.task_id}, protocol published, seed 0." in text
+    captions = re.findall(r"<figcaption>(Episode [^<]+)<", text)
+    assert captions == ["Episode 1: return 0", "Episode 3: return 0"] * 2
+    with pytest.raises(OptionError, match="report: exists"):
+        run_cli("report", tmp_path / "run")
+    run_cli("report", tmp_path / "run", "--overwrite")
     (tmp_path / "run" / "tasks.jsonl").unlink()
     with pytest.raises(OptionError, match=r"is neither a published test task, .* nor in the results' tasks\.jsonl"):
         run_cli("report", tmp_path / "run")
+    (tmp_path / "tasks.jsonl").write_text("{}\n")
+    with pytest.raises(TaskFormatError, match="line 1"):
+        run_cli(*played)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from icrl4aht_baselines.training.histories import hold_out, training_cells
+from icrl4aht_baselines.training.histories import training_cells
 from icrl4aht_baselines.training.seen import SeenInTraining, read_trained_on
 from icrl4aht_generation.teammates.instances import published_task
 
@@ -17,17 +17,6 @@ from icrl4aht_data.errors import NotStoredError, OptionError
 def dataset(two_sources) -> Dataset:
     """Return the noise histories of demo_wide in split train, with two teammates."""
     return load_icrl4aht(two_sources[0], split="train", layout="demo_wide", source="noise")
-
-
-def test_held_out_teammates_are_not_in_the_training_data(dataset):
-    split = hold_out(dataset, 0.1)
-    assert split.teammates is not None
-    held = teammate_ids(dataset, split.teammates.ids.tolist())
-    trained = teammate_ids(dataset, split.train.ids.tolist())
-    assert held
-    assert trained
-    assert not set(held) & set(trained)
-    assert len(trained) == len({entry.task_id for entry in split.train.entries})
 
 
 def test_training_record_lists_all_teammates_of_each_family(dataset):

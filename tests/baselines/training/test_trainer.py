@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import shutil
 import signal
@@ -18,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
 from icrl4aht_baselines.training import trainer as training
 from icrl4aht_baselines.training.histories import hold_out, prepare
@@ -33,6 +33,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
+from tests.helpers.spoiled import read_lines
 from tests.helpers.tiny import start
 from tests.helpers.two_sources import two_source_release
 from tests.helpers.xla_flags import add_xla_flag
@@ -102,7 +103,7 @@ class TestResume:
 
     def test_training_writes_log_curves_and_settings(self, full_run):
         folder, state = full_run
-        lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        lines = read_lines(folder / "metrics.jsonl")
         assert [(line["step"], line["part"]) for line in lines] == [
             (2, "train"),
             (3, "held out"),
@@ -256,9 +257,7 @@ class TestHeldOut:
         random_release(tmp_path / "r", layouts=("demo_wide",), teammates=5, streams=4, episodes=2)
         dataset = load_icrl4aht(tmp_path / "r", obs="state")
         monkeypatch.setattr(dataset_module, "teammate_ids", lambda dataset, ids: None)
-        split = hold_out(dataset, 0.25)
-        assert split.histories is not None
-        assert split.teammates is not None
+        split: Any = hold_out(dataset, 0.25)
         parts = (split.train, split.histories, split.teammates)
         assert [len(part) for part in parts] == [12, 4, 4]
         assert sorted(np.concatenate([part.ids for part in parts]).tolist()) == list(range(20))
@@ -281,9 +280,8 @@ class TestHeldOut:
 
     def test_tasks_with_one_history_are_not_held_out(self, two_sources):
         dataset = load_icrl4aht(two_sources[0], source="ppo", layout="demo_wide")
-        split = hold_out(dataset[3:8], validation=dataset[:1])  # tasks of one history and of four histories
+        split: Any = hold_out(dataset[3:8], validation=dataset[:1])  # tasks of one history and of four histories
         assert split.train.ids.tolist()[0] == dataset.ids[3]
-        assert split.histories is not None
         assert (len(split.train), len(split.histories)) == (4, 1)
         assert hold_out(dataset[3:5]).histories is None
         with pytest.raises(OptionError, match=r"every task of .* has one history: expected a task with two"):
@@ -306,17 +304,14 @@ class TestHeldOut:
     def test_samplers_use_options_every_and_queries(self, two_sources):
         found = job(two_sources[0], context=40, every=3)
         assert {sampler.every for sampler in (found.data.train, *found.data.validation.values())} == {3}
-        assert job(two_sources[0], "dpt", context=40, queries=3).data.train[0].query_target.shape == (
-            OPTIONS.batch_size,
-            3,
-        )
+        dpt = job(two_sources[0], "dpt", context=40, queries=3)
+        assert dpt.data.train[0].query_target.shape == (OPTIONS.batch_size, 3)
 
     def test_only_teammate_of_the_data_is_not_held_out(self):
         dataset = load_icrl4aht(layout="asymm_both_plain")
         dataset = dataset.filter(task_id=dataset.entries[0].task_id)[:5]
-        split = hold_out(dataset)
+        split: Any = hold_out(dataset)
         assert split.teammates is None
-        assert split.histories is not None
         assert [len(split.train), len(split.histories)] == [len(dataset) - 1, 1]
 
     def test_filters_select_histories_and_are_recorded(self):
@@ -371,31 +366,38 @@ class TestHeldOut:
 
 
 DEVICES = """
-import json, os, sys
+import os, sys
+from pathlib import Path
 import jax
 import jax.experimental.multihost_utils
-if len(sys.argv) > 2:
-    jax.distributed.initialize(sys.argv[2], num_processes=2, process_id=int(os.environ["PROCESS"]))
+root, out, *address = sys.argv[1:]
+out = Path(out)
+number = int(os.environ.get("PROCESS", 0))
+if address:
+    jax.distributed.initialize(*address, num_processes=2, process_id=number)
     # Connect before compiling: a process that compiles for over 30 seconds makes the other fail to connect.
     jax.experimental.multihost_utils.sync_global_devices("start")
-from pathlib import Path
-from icrl4aht_baselines.training.histories import prepare
-from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
-options = TrainOptions(steps=3, batch_size=4, context=6, log_every=1, validation_batches=1, accumulate=2)
-model = ModelOptions(layers=1, width=8, heads=2)
-root, out = sys.argv[1].split(",")
-job = prepare("ad", model, options, HistoryOptions(("demo_wide",), root))
-def done(step, loss):
-    if step == 1 and os.environ.get("STOP"):
-        os.kill(os.getpid(), int(os.environ["STOP"]))
-state = job._replace(options=options).train(Path(out), done=done)
-print(json.dumps({"devices": jax.device_count()}))
+from icrl4aht_baselines.training.stopping import TrainingStopped
+from tests.baselines.training.test_trainer import Checkpoints, read_lines, small_job
+assert jax.device_count() == 2
+def stop(step, loss):
+    if number == 1 and step == 1:
+        os.kill(os.getpid(), 15)
+try:
+    small_job(root).train(out, done=stop)
+except TrainingStopped as stopped:
+    steps = [line["step"] for line in read_lines(out / "metrics.jsonl")]
+    print(stopped.code, Checkpoints(out / "checkpoints").steps, steps, flush=True)
+    jax.experimental.multihost_utils.sync_global_devices("stopped")
+    small_job(root).train(out)
 """
 
 
-def metrics(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+def small_job(root: Path) -> TrainingTask:
+    """Return a training job with dropout, gradient accumulation and validation."""
+    options = TrainOptions(steps=3, batch_size=4, context=6, log_every=1, validation_batches=1, accumulate=2)
+    model = ModelOptions(layers=1, width=8, heads=2)
+    return prepare("ad", model, options, HistoryOptions(("demo_wide",), str(root)))
 
 
 def test_processes_split_the_rows_of_a_batch(lite, monkeypatch):
@@ -414,48 +416,39 @@ def test_processes_split_the_rows_of_a_batch(lite, monkeypatch):
 @pytest.fixture(scope="module")
 def one_device_log(lite, tmp_path_factory) -> list[dict[str, Any]]:
     folder = tmp_path_factory.mktemp("one")
-    return train_across(lite[0], folder, [{}])
+    small_job(lite[0]).train(folder)
+    return read_lines(folder / "metrics.jsonl")
 
 
-def train_across(
-    root: Path, folder: Path, environments: list[dict[str, str]], *arguments: str, code: int = 0
-) -> list[dict[str, Any]]:
-    """Train in one process for each dict of environment variables, check exit codes, and return the log."""
-    processes = [
-        start("-c", DEVICES, f"{root},{folder / 'run'}", *arguments, **environment) for environment in environments
-    ]
+def check_two_devices(
+    log: list[dict[str, Any]], root: Path, folder: Path, environments: list[dict[str, str]], *arguments: str
+) -> list[str]:
+    """Train in a process for each dict of environment variables, check the log, and return each process's output."""
+    processes = [start("-c", DEVICES, str(root), str(folder), *arguments, **one) for one in environments]
     outputs = [process.communicate(timeout=240) for process in processes]
-    for process, (out, error) in zip(processes, outputs, strict=True):
-        assert process.returncode == code, error
-        if code == 0:
-            assert json.loads(out.splitlines()[-1])["devices"] == (2 if environments != [{}] else 1)
-    return metrics(folder / "run")
-
-
-def assert_close(one: list[dict[str, Any]], two: list[dict[str, Any]]) -> None:
-    assert [(line["step"], line["part"]) for line in one] == [(line["step"], line["part"]) for line in two]
-    for a, b in zip(one, two, strict=True):
+    for process, (_, error) in zip(processes, outputs, strict=True):
+        assert process.returncode == 0, error
+    found = read_lines(folder / "metrics.jsonl")
+    assert [(line["step"], line["part"]) for line in found] == [(line["step"], line["part"]) for line in log]
+    for a, b in zip(found, log, strict=True):
         for name in a.keys() - {"part"}:
             np.testing.assert_allclose(a[name], b[name], rtol=2e-5, atol=1e-7, err_msg=name)
+    return [out for out, _ in outputs]
 
 
 @pytest.mark.slow
 def test_two_devices_give_the_log_of_one_device(lite, tmp_path, one_device_log):
-    """Two devices give the same log as one device, with dropout, gradient accumulation and validation."""
-    two = train_across(lite[0], tmp_path, [{"XLA_FLAGS": add_xla_flag("--xla_force_host_platform_device_count=2")}])
-    assert_close(two, one_device_log)
+    flags = add_xla_flag("--xla_force_host_platform_device_count=2")
+    check_two_devices(one_device_log, lite[0], tmp_path, [{"XLA_FLAGS": flags}])
 
 
 @pytest.mark.slow
 def test_two_processes_stop_together_and_give_the_log_of_one_device(lite, tmp_path, one_device_log):
-    """After a SIGTERM to process 1, both processes save a checkpoint; the same command resumes training."""
+    """After a SIGTERM to process 1, both processes save a checkpoint; the same call resumes training."""
     with socket.socket() as held:  # keeps the port free for JAX's coordinator, which can share it
         held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         held.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{held.getsockname()[1]}"
         both = [{"PROCESS": "0"}, {"PROCESS": "1"}]
-        stopped = train_across(lite[0], tmp_path, [both[0], both[1] | {"STOP": "15"}], address, code=143)
-        assert [line["step"] for line in stopped] == [1]
-        assert Checkpoints(tmp_path / "run" / CHECKPOINTS).steps == [1]
-        two = train_across(lite[0], tmp_path, both, address)
-    assert_close(two, one_device_log)
+        outputs = check_two_devices(one_device_log, lite[0], tmp_path, both, address)
+    assert [out.splitlines()[-1] for out in outputs] == ["143 [1] [1]"] * 2

@@ -30,7 +30,7 @@ def env():
 # Gymnasium takes observations of 5x5 cells for images and warns that they should be resized.
 @pytest.mark.filterwarnings("ignore:.*resize")
 def test_environment_passes_the_checker_of_gymnasium():
-    check_env(gymnasium.make(NAME, channels="canonical", render_mode="rgb_array").unwrapped)
+    check_env(gymnasium.make(NAME, render_mode="rgb_array").unwrapped)
 
 
 def test_every_published_test_task_has_an_environment_id():
@@ -140,14 +140,6 @@ def test_recovered_environments_accept_length_and_render_mode():
 def test_recovering_environment_of_release_without_tasks_raises_error(converted_release):
     with pytest.raises(NotStoredError, match=r"convert again with tasks\.jsonl"):
         load_icrl4aht(converted_release).recover_environment(0)
-
-
-def test_episode_number_out_of_range_raises_error():
-    dataset, history = first_history(layout="demo_wide", source="noise")
-    with pytest.raises(OptionError, match=r"episode = 40: history \d+ has episodes 0\.\.39"):
-        dataset.reset_options(history.entry.history_id, 40)
-    with pytest.raises(OptionError, match="episode = -1"):
-        dataset.reset_options(history.entry.history_id, -1)
 
 
 @pytest.mark.parametrize(

@@ -59,21 +59,13 @@ def test_first_generated_layouts_do_not_depend_on_the_count(family, samples):
     assert layout_fields(generate_layouts(family, 0, 30)) == layout_fields(samples[family][:30])
     assert [one.rows for one in generate_layouts(family, 1, 5)] != [one.rows for one in samples[family][:5]]
     assert generate_layouts(family, 0, 0) == []
-
-
-@EVERY_FAMILY
-def test_generated_layout_is_found_by_its_name(family, samples):
     assert layout_fields([find_generated(f"{family}-0-7")]) == layout_fields(samples[family][7:8])
 
 
 @EVERY_FAMILY
-def test_no_two_layouts_are_equal_up_to_symmetry(family, samples):
+def test_generated_layouts_are_solvable_and_distinct_up_to_symmetry(family, samples):
     maps = [canonical_map(get_layout(name)) for name in LAYOUT_NAMES] + [canonical_map(one) for one in samples[family]]
     assert len(set(maps)) == len(maps)
-
-
-@EVERY_FAMILY
-def test_every_generated_layout_is_solvable(family, samples):
     for layout in samples[family]:
         check_solvable(layout)
 

@@ -6,6 +6,7 @@ import hashlib
 from collections import Counter
 
 import pytest
+from icrl4aht_generation.layouts.grids import agent_rooms, neighbours
 from icrl4aht_generation.layouts.rearranged import rearranged_layouts, with_four_recipes
 
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -16,15 +17,9 @@ TRAINING = TRACKS["layout"]["train"]
 
 
 def facing_counts(layout):
-    """Return the number of fixtures by map letter and by the set of agents that can face them."""
-    found = Counter()
-    for cell, letter in enumerate("".join(layout.rows)):
-        x, y = cell % layout.width, cell // layout.width
-        around = {(x + 1, y), (x - 1, y), (x, y + 1), (x, y - 1)}
-        cells = {b * layout.width + a for a, b in around if 0 <= a < layout.width and 0 <= b < layout.height}
-        agents = tuple(agent for agent, room in enumerate(layout.rooms) if cells & set(room.tolist()))
-        found[agents, letter] += 1
-    return found
+    """Return the number of fixtures by map letter and by the agents that can face them."""
+    faced = [neighbours(room).ravel().tolist() for room in agent_rooms(layout)]
+    return Counter(zip(*faced, "".join(layout.rows), strict=True))
 
 
 @pytest.mark.parametrize(

@@ -21,21 +21,18 @@ def make_layout(rows: tuple[str, ...], recipes=ZERO) -> Layout:
     return Layout("mine", "mine", rows, recipes)
 
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_published_layouts_are_solvable(layout):
-    check_solvable(layout)
-
-
 @pytest.mark.parametrize(
-    ("rows", "recipes"),
+    "layout",
     [
-        (("W0WPW", "BA AX", "WWWWW"), ZERO),
-        (HANDOVER, MIXED),  # agents hand items over the counter between them
-        (TWO_FILL, MIXED),  # each agent reaches one ingredient, and both reach the pot
+        *LAYOUTS.values(),
+        make_layout(("W0WPW", "BA AX", "WWWWW")),
+        make_layout(HANDOVER, MIXED),  # agents hand items over the counter between them
+        make_layout(TWO_FILL, MIXED),  # each agent reaches one ingredient, and both reach the pot
     ],
+    ids=lambda layout: layout.name,
 )
-def test_layouts_that_need_cooperation_are_solvable(rows, recipes):
-    check_solvable(make_layout(rows, recipes))
+def test_published_layouts_and_layouts_that_need_cooperation_are_solvable(layout):
+    check_solvable(layout)
 
 
 @pytest.mark.parametrize(

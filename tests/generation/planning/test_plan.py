@@ -69,17 +69,12 @@ def test_estimated_sizes_match_the_bundled_release():
     assert shards == pytest.approx(expected, rel=0.1)
 
 
-def test_estimated_artefact_size_matches_stored_arrays(built):
-    profile = load_profile(str(built / "tiny.toml"))
-    arrays = sum(path.stat().st_size for path in artefact(built / "a").glob("*.npy"))
-    egos = [(get_layout(name), profile.ego) for name in profile.layouts]
-    assert plan.artefact_bytes(egos) == arrays - 5 * 128  # NumPy's headers take 128 bytes each
-
-
 def test_plan_command_measures_speed_and_prints_costs(built):
     found = json.loads(run_cli("plan", "--profile", built / "tiny.toml", "--json"))
     assert (found["tasks"], found["devices"]) == (1, 8)
     assert 0 < found["steps_per_second"] < plan.ENVIRONMENT_STEPS_PER_SECOND
+    arrays = sum(path.stat().st_size for path in artefact(built / "a").glob("*.npy"))
+    assert found["artefact_bytes"] == arrays - 5 * 128  # NumPy's headers take 128 bytes each
     printed = run_cli("plan", "--profile", built / "tiny.toml", "--devices", "2")
     for expected in ("environment steps", "disk, lite", "CPU cores", "hours on 2 devices"):
         assert expected in printed

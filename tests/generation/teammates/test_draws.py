@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 from icrl4aht_generation.teammates import draws
@@ -22,6 +20,7 @@ from icrl4aht_generation.teammates.draws import (
     write_table,
 )
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
+from icrl4aht_generation.teammates.spread import SPREAD_TABLE, LayoutSpread
 from msgspec.structs import replace
 
 from icrl4aht_data.benchmark.facts import TESTED_ON, TRACKS
@@ -65,10 +64,11 @@ def test_draws_table_has_every_draw_once():
     assert draw_key(read_draws("demo_cook_wide", H1, 1)[3]) == ("demo_wide", H1, 1, 3)
 
 
-def test_draws_table_is_in_canonical_form(tmp_path):
-    """Reading and writing the table gives the same bytes."""
-    write_table(tmp_path / "again.jsonl", reversed(read_measured(DRAWS_TABLE, Draw)))
-    assert (tmp_path / "again.jsonl").read_bytes() == DRAWS_TABLE.read_bytes()
+@pytest.mark.parametrize(("table", "kind"), [(DRAWS_TABLE, Draw), (SPREAD_TABLE, LayoutSpread)])
+def test_tables_are_in_canonical_form(table, kind, tmp_path):
+    """Reading and writing a table gives the same bytes."""
+    write_table(tmp_path / "again.jsonl", reversed(read_measured(table, kind)))
+    assert (tmp_path / "again.jsonl").read_bytes() == table.read_bytes()
 
 
 @pytest.mark.parametrize("layout", TESTED_ON)
@@ -87,19 +87,13 @@ def test_chosen_draws_differ_from_test_teammates_of_their_family(layout):
                 drawn_teammates(layout, [family], 1, seed)
 
 
-@cache
-def training_theta(family: str, theta_id: int) -> dict[str, Any]:
-    return sample_teammate(family, theta_id, "train")["theta"]
-
-
 def test_validation_teammates_are_not_training_teammates():
     for track in TRACKS:
         for task in validation_tasks(track):
             layout, family = task.layout.name, task.teammate["family"]
             assert task.teammate["base_seed"] == 1
-            assert task.teammate["theta"] not in [
-                training_theta(family, one.theta_id) for one in read_draws(layout, family)
-            ]
+            trained = [sample_teammate(family, one.theta_id, "train") for one in read_draws(layout, family)]
+            assert task.teammate["theta"] not in [entry["theta"] for entry in trained]
 
 
 def test_each_layout_has_up_to_four_validation_tasks():
@@ -143,12 +137,17 @@ def test_draws_alternate_between_families_and_start_with_new_behaviours(monkeypa
 
 
 def test_draws_with_more_headroom_come_first(monkeypatch, tmp_path):
-    """Draws are sorted by headroom: first the lowest-numbered draw of each behaviour, then all other draws."""
+    """Draws are sorted by headroom: first the lowest-numbered draw of each behaviour, then all other draws.
+
+    Draws that are similar to test teammates of other families come last.
+    """
     first = [draw(H1, 0, oracle=20.0), draw(H1, 1, behaviour=1, oracle=50.0), draw(H1, 2, behaviour=2, oracle=-30.0)]
     others = [draw(H1, 3, oracle=25.0), draw(H1, 4, oracle=45.0), draw(H1, 5, behaviour=1, oracle=25.0)]
-    use_table(monkeypatch, tmp_path, *first, *others)
+    like = replace(draw(H1, 6, behaviour=3, oracle=60.0), other="H4/t0", other_distance=0.0199)
+    unlike = replace(draw(H1, 7, behaviour=3, oracle=10.0), other="H4/t0", other_distance=0.02)
+    use_table(monkeypatch, tmp_path, *first, *others, like, unlike)
     assert [found.spread for found in first] == [19.0, 49.0, 32.0]
-    assert [theta_id for _, theta_id in chosen([H1], 6)] == [1, 2, 0, 4, 3, 5]
+    assert [theta_id for _, theta_id in chosen([H1], 8)] == [1, 2, 0, 7, 4, 3, 5, 6]
 
 
 def test_draws_similar_to_a_test_teammate_are_left_out(monkeypatch, tmp_path):
@@ -159,13 +158,6 @@ def test_draws_similar_to_a_test_teammate_are_left_out(monkeypatch, tmp_path):
         OptionError, match=f"1 draws act like a test teammate .*distance 0.000.*0.02 or more, to H3/t0.*1 of {H1}"
     ):
         drawn_teammates("demo_wide", [H1, H2], 1)
-
-
-def test_draws_similar_to_test_teammates_of_other_families_come_last(monkeypatch, tmp_path):
-    like = replace(draw(H1, 0, oracle=50.0), other="H4/t0", other_distance=0.0199)
-    unlike = replace(draw(H1, 1, oracle=20.0), other="H4/t0", other_distance=0.02)
-    use_table(monkeypatch, tmp_path, like, unlike, draw(H1, 2, behaviour=1, oracle=10.0))
-    assert [theta_id for _, theta_id in chosen([H1], 3)] == [1, 2, 0]
 
 
 def test_draws_without_headroom_are_left_out_if_other_draws_have_headroom(monkeypatch, tmp_path):
@@ -179,7 +171,7 @@ def test_draws_without_headroom_are_left_out_if_other_draws_have_headroom(monkey
 
 
 def test_unknown_names_of_draws_raise_errors():
-    with pytest.raises(OptionError, match=f"unknown teammate family 'H4'; valid: {H1}, "):
+    with pytest.raises(UnknownNameError, match=f"unknown teammate family 'H4'; valid: {H1}, "):
         drawn_teammates("demo_wide", ["H4"], 1)
     with pytest.raises(UnknownNameError, match="unknown training layout 'asymm_right'"):
         read_draws("asymm_right", H1)

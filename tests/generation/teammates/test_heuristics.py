@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from typing import Any, get_args
 
 import jax
@@ -13,9 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from icrl4aht_generation.env import Environment
-from icrl4aht_generation.policy import Noise
-from icrl4aht_generation.teammates.heuristics import territory
+from icrl4aht_generation.experts.padded import padded_layout
+from icrl4aht_generation.policy import Noise, Situation
+from icrl4aht_generation.teammates.heuristics import territory, utility_greedy
 from icrl4aht_generation.teammates.heuristics.heuristic import draw
+from icrl4aht_generation.teammates.heuristics.utility_greedy import GreedyMemory
 from icrl4aht_generation.teammates.instances import published_teammates
 from icrl4aht_generation.teammates.registry import (
     HEURISTIC_FAMILIES,
@@ -25,10 +27,11 @@ from icrl4aht_generation.teammates.registry import (
 )
 
 from icrl4aht_data.overcooked import rules
-from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS, STAY
+from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS, STAY, UP
 from icrl4aht_data.overcooked.cells import COOKED, PLATE
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
-from icrl4aht_data.overcooked.state import faults
+from icrl4aht_data.overcooked.state import faults, record_size
+from icrl4aht_data.overcooked.tables import Tables
 from tests.helpers.states import random_records, state_record
 
 H1, H2, H3, H4 = "recipe_aware_button", "territory", "assembly_line", "utility_greedy"
@@ -84,18 +87,23 @@ def stacked(family: str, thetas: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     return {name: np.array([theta[name] for theta in thetas], dtype) for name, dtype in dtypes.items()}
 
 
-@lru_cache
-def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.ndarray]:
-    """Return actions (100, 5, N) and returns (5, N) of t0..t4 as agent 1, with published noise and an ego that stays.
+@cache
+def start_records(name: str) -> np.ndarray:
+    """Return 128 records of random starts, and the published start."""
+    records = jax.jit(Environment(LAYOUTS[name]).init)(jax.random.split(jax.random.key(7), 128)).record
+    return np.concatenate([records, state_record(LAYOUTS[name], (1, 1, "up"), (5, 2, "up"))])
 
-    The last episode starts from the published state and has a constant recipe.
+
+@cache
+def played(name: str, family: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return actions (100, 5, 129) and returns (5, 129) of t0..t4 as agent 1, with published noise.
+
+    The ego always stays. The last episode starts from the published state and has a constant recipe.
     """
-    layout = LAYOUTS[name]
+    layout, records = LAYOUTS[name], start_records(name)
     entries = published_teammates(name, family)
     policy = build_teammate(layout, entries[0], noise="fixed")
-    records = jax.jit(Environment(layout).init)(jax.random.split(jax.random.key(7), episodes)).record
-    pinned = state_record(layout, (1, 1, "up"), (5, 2, "up"))
-    recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, episodes + 1))
+    recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, len(records)))
     recipes[:, -1] = layout.recipe_items[0]
 
     def play_episode(params, record, recipes):
@@ -107,10 +115,9 @@ def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.
 
         return jax.lax.scan(step, (record, policy.init(params, jax.random.key(99))), recipes)[1]
 
-    batch = jax.vmap(jax.vmap(play_episode, (None, 0, 1), 1), (0, None, None), 1)
-    run = jax.jit(batch)
+    run = jax.jit(jax.vmap(jax.vmap(play_episode, (None, 0, 1), 1), (0, None, None), 1))
     params = stacked(family, [entry["theta"] for entry in entries])
-    actions, rewards = run(params, np.concatenate([records, pinned]), recipes)
+    actions, rewards = run(params, records, recipes)
     return np.asarray(actions), np.asarray(rewards.sum(axis=0))
 
 
@@ -158,35 +165,50 @@ ROWS = 48
 ALL_SLOTS = tuple((family, slot) for family in HEURISTIC_FAMILIES for slot in (0, 1))
 
 
-@lru_cache
-def compiled_teammates(layout: Layout, slots: tuple[tuple[str, int], ...] = ALL_SLOTS) -> tuple[dict, Callable]:
-    """Return the policies by (family, agent), and one compiled program that steps all policies.
+@cache
+def compiled_teammates() -> tuple[dict, Callable]:
+    """Return the policies by (family, agent), and one compiled program that steps all policies on any layout.
 
-    The program maps parameters and memories (ROWS, ...), in the order of the slots, and records (ROWS, S) to actions
-    and memories.
+    The program maps parameters and memories (ROWS, ...), in the order of `ALL_SLOTS`, padded records (ROWS, S) and
+    padded tables to actions and memories.
     """
-    policies = {slot: build_teammate(layout, heuristic_teammate(slot[0], "default", 0), slot[1]) for slot in slots}
+    policies = {slot: build_teammate(None, heuristic_teammate(slot[0], "default", 0), slot[1]) for slot in ALL_SLOTS}
 
-    def act(params, memories, record):
-        key = jax.random.key(0)
-        return [policies[s].act(p, m, record, key) for s, p, m in zip(slots, params, memories, strict=True)]
+    def act(params, memories, record, tables):
+        view, key = Situation(tables, record), jax.random.key(0)
+        return [policies[s].act(p, m, view, key) for s, p, m in zip(ALL_SLOTS, params, memories, strict=True)]
 
-    return policies, jax.jit(jax.vmap(act))
-
-
-def act_all(layout: Layout, slots, params: dict, memories: dict, records: np.ndarray) -> dict:
-    _, act = compiled_teammates(layout, slots)
-    return dict(zip(slots, act(*([part[slot] for slot in slots] for part in (params, memories)), records), strict=True))
+    return policies, jax.jit(jax.vmap(act, in_axes=(0, 0, 0, None)))
 
 
-@lru_cache
-def first_memories(layout: Layout, slots=ALL_SLOTS) -> dict:
+def padded(layout: Layout, records: np.ndarray) -> tuple[Tables, np.ndarray]:
+    """Return tables and records padded to common shapes, so that all layouts share one compilation."""
+    tables, _, positions = padded_layout(layout)
+    found = np.zeros((len(records), record_size(tables)), np.uint8)
+    found[:, positions] = records
+    return tables, found
+
+
+def act_all(layout: Layout, params: dict, memories: dict, records: np.ndarray) -> dict:
+    _, act = compiled_teammates()
+    tables, records = padded(layout, records)
+    inputs = ([part[slot] for slot in ALL_SLOTS] for part in (params, memories))
+    return dict(zip(ALL_SLOTS, act(*inputs, records, tables), strict=True))
+
+
+@cache
+def first_memories() -> dict:
     keys = jax.random.split(jax.random.key(4), ROWS)
-    policies, _ = compiled_teammates(layout, slots)
+    policies, _ = compiled_teammates()
     return {slot: jax.vmap(p.init, (None, 0))(p.params, keys) for slot, p in policies.items()}
 
 
-@lru_cache
+@cache
+def default_params() -> dict:
+    return {slot: stacked(slot[0], [HEURISTIC_FAMILIES[slot[0]].defaults] * ROWS) for slot in ALL_SLOTS}
+
+
+@cache
 def many_params(name: str) -> dict:
     """Return ROWS parameter sets for every (family, agent): published parameters, presets and sampled parameters."""
     params = {}
@@ -213,11 +235,11 @@ def test_every_family_plays_every_layout_as_both_agents(name):
     """In row i, two agents of family i % 4 play with each other; other families act on the same states."""
     layout = LAYOUTS[name]
     rng = np.random.default_rng(2)
-    params, memories = many_params(name), first_memories(layout)
+    params, memories = many_params(name), first_memories()
     shapes = jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), memories)
     records, digest = random_records(layout, ROWS, rng), hashlib.sha256()
     for _ in range(25):
-        acted = act_all(layout, ALL_SLOTS, params, memories, records)
+        acted = act_all(layout, params, memories, records)
         memories = {slot: memory for slot, (_, memory) in acted.items()}
         actions = np.stack([acted[slot][0] for slot in ALL_SLOTS])
         assert actions.dtype == np.int32
@@ -242,17 +264,15 @@ def one_step(
     layout: Layout, family: str, slot: int, theta: dict[str, float], mine, partner, memory=None, **fields
 ) -> tuple[str, Any]:
     """Return a teammate's action and memory; `mine` and `partner` are (x, y, facing, item in hand)."""
-    slots = SLOTS_ON.get(layout.name, ((family, slot),))
     agents = (mine, partner) if slot == 0 else (partner, mine)
     fields["hands"] = [agent[3] for agent in agents]
     records = np.repeat(state_record(layout, agents[0][:3], agents[1][:3], **fields), ROWS, axis=0)
-    memories = first_memories(layout, slots)
+    memories = first_memories()
     mind = memories[family, slot]
     if memory:
         mind = mind._replace(**{name: np.full_like(getattr(mind, name), v) for name, v in memory.items()})
-    params = {own: stacked(own[0], [HEURISTIC_FAMILIES[own[0]].defaults] * ROWS) for own in slots}
-    params[family, slot] = stacked(family, [HEURISTIC_FAMILIES[family].defaults | theta] * ROWS)
-    actions, after = act_all(layout, slots, params, memories | {(family, slot): mind}, records)[family, slot]
+    own = {(family, slot): stacked(family, [HEURISTIC_FAMILIES[family].defaults | theta] * ROWS)}
+    actions, after = act_all(layout, default_params() | own, memories | {(family, slot): mind}, records)[family, slot]
     assert len(set(actions.tolist())) == 1
     return ACTIONS[actions[0]], jax.tree.map(lambda leaf: leaf[0], after)
 
@@ -318,12 +338,6 @@ DEMO_CASES = [
     (H3, {"stubbornness": 1.0}, {}, "1 13- 51- right, 1 130 51- right, 0 41- 13- left"),
     (H3, {}, {}, "1 13- 51- down"),
 ]
-SLOTS_ON = {
-    "cramped_down": ALL_SLOTS[:-2],
-    "asymm_right": ((H1, 1), (H2, 1)),
-    "demo_wide": ALL_SLOTS,
-}
-"""Families and agents that are tested on each layout, and compiled together."""
 SCENES = {"cramped_down": CRAMPED_CASES, "asymm_right": ASYMM_CASES, "demo_wide": DEMO_CASES}
 """Cases by layout: family, parameters, state, and moves. A move has the agent's number, the agent's and the partner's
 x, y, hand (- nothing, p plate, d dish, 0 or 1) and facing (default up), and the expected action. cramped_down has
@@ -380,6 +394,43 @@ def split_key(key: jax.Array, n: int) -> list[int]:
 def test_h1_presses_the_button_to_see_the_recipe(theta, memory, fields, expected, steps):
     action, after = one_step(UNSIGNED, H1, 1, theta, (4, 1, "up", 0), (5, 2, "up", 0), memory, **fields)
     assert action == expected
-    start = first_memories(UNSIGNED, ((H1, 1),))[H1, 1].key[0]
+    start = first_memories()[H1, 1].key[0]
     assert jax.random.key_data(after.key).tolist() == split_key(start, steps)
     assert int(after.recipe) == (3 * ZERO if fields.get("buttons") else memory.get("recipe", 0))
+
+
+ROLLS = np.array([0, 1, 19, 20, 39, 40, 41, 99] * (ROWS // 8))
+"""Random numbers below 100 by which H4 decides whether it yields to its partner, and how long."""
+
+
+def greedy_memory(intent: int = -1, wait: int = 0) -> GreedyMemory:
+    key = jax.random.wrap_key_data(jnp.array([[300 + roll, 7] for roll in ROLLS], jnp.uint32))
+    return GreedyMemory(key, jnp.full(ROWS, intent, jnp.int32), jnp.full(ROWS, wait, jnp.int32))
+
+
+def move_h4_up(slot: int, partner: tuple[int, int, str], memory: GreedyMemory) -> tuple[np.ndarray, GreedyMemory]:
+    """Return actions and memories of H4 with empty hands at (1, 2), which wants to move up, towards pile 0."""
+    layout, mover = LAYOUTS["cramped_up"], (1, 2, "up")
+    record = state_record(layout, *((mover, partner) if slot == 0 else (partner, mover)))
+    memories = first_memories() | {(H4, slot): memory}
+    return act_all(layout, default_params(), memories, np.repeat(record, ROWS, axis=0))[H4, slot]
+
+
+@pytest.mark.parametrize("slot", [0, 1])
+def test_h4_yields_only_if_its_next_cell_is_adjacent_to_the_partner(slot):
+    actions, after = move_h4_up(slot, (2, 1, "down"), greedy_memory())
+    yields = (20, 40)[slot] > ROLLS
+    np.testing.assert_array_equal(actions, np.where(yields, STAY, UP))
+    np.testing.assert_array_equal(after.wait, np.where(yields, 1 + ROLLS % 2, 0))
+    assert (after.intent == utility_greedy.FETCH).all()
+    actions, after = move_h4_up(slot, (3, 2, "down"), greedy_memory())
+    assert (actions == UP).all() and (after.wait == 0).all()
+
+
+def test_waiting_h4_keeps_its_intent_and_advances_its_random_key():
+    memory = greedy_memory(utility_greedy.PRESS, wait=2)
+    for wait in (1, 0):
+        following = jax.vmap(lambda key: jax.random.split(key, 3)[0])(memory.key)
+        actions, memory = move_h4_up(1, (2, 1, "down"), memory)
+        assert (actions == STAY).all() and (memory.wait == wait).all()
+        assert (memory.intent == utility_greedy.PRESS).all() and (memory.key == following).all()

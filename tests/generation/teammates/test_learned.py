@@ -47,11 +47,6 @@ def suite(tmp_path_factory) -> Path:
     return root
 
 
-def entry(suite: Path, name: str) -> dict[str, Any]:
-    theta = {"checkpoint": name, "sha256": file_hash(suite / name / POLICY_WEIGHTS)}
-    return {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0, "theta": theta}
-
-
 def states(steps: int, seed: int) -> np.ndarray:
     """Return random state records, uint8 (steps, ENVS, S)."""
     return random_records(LAYOUT, steps * ENVS, np.random.default_rng(seed)).reshape(steps, ENVS, -1)
@@ -144,8 +139,8 @@ def test_incomplete_checkpoint_raises_error_with_expected_files(tmp_path, missin
 
 
 def test_checkpoint_with_another_hash_than_the_task_raises_error(suite):
-    other = entry(suite, "a")
-    other["theta"] = {"checkpoint": "b", "sha256": other["theta"]["sha256"]}
+    theta = {"checkpoint": "b", "sha256": file_hash(suite / "a" / POLICY_WEIGHTS)}
+    other = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0, "theta": theta}
     with pytest.raises(TaskFormatError, match=f"sha256 {file_hash(suite / 'b' / POLICY_WEIGHTS)}, expected") as error:
         learned.build_learned_entry(LAYOUT, other, suite)
     assert other["theta"]["sha256"] in str(error.value)

@@ -1,28 +1,23 @@
-"""Tasks of the track preference: stored manifests, disjoint splits, and layouts that hide the recipe."""
+"""Tasks of the track preference: disjoint splits, and layouts that hide the recipe."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 
 import pytest
-from icrl4aht_generation.layouts.families import find_generated, split_of
+from icrl4aht_generation.layouts.families import generate_layouts, split_of
 from icrl4aht_generation.layouts.grids import canonical_map
 from icrl4aht_generation.teammates.instances import INSTANCES
 from icrl4aht_generation.teammates.preference import WATCHER, all_dishes, preference_tasks, training_dishes
 
-from icrl4aht_data.benchmark.facts import PREFERENCE, PREFERENCE_LAYOUTS
-from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks, teammate_id
+from icrl4aht_data.benchmark.facts import PREFERENCE_LAYOUTS
+from icrl4aht_data.benchmark.tasks import Task, teammate_id
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 
 
 @pytest.fixture(scope="module")
 def split_tasks() -> dict[str, list[Task]]:
     return {split: preference_tasks(split) for split in ("train", "validation", "test")}
-
-
-def test_manifests_contain_the_preference_tasks(split_tasks):
-    for split, tasks in split_tasks.items():
-        assert read_tasks(manifest_path(PREFERENCE, split)) == tasks
 
 
 def test_preference_splits_share_no_teammates_and_hold_out_layouts_and_recipes(split_tasks):
@@ -55,6 +50,7 @@ def test_preference_splits_share_no_teammates_and_hold_out_layouts_and_recipes(s
 
 def test_preference_layouts_hide_the_recipe_and_match_their_names():
     maps = Counter()
+    generated = {one.name: one for family in ("rooms", "templates") for one in generate_layouts(family, 0, 300)}
     for split, names in PREFERENCE_LAYOUTS.items():
         for name in names:
             layout = get_layout(name)
@@ -66,6 +62,6 @@ def test_preference_layouts_hide_the_recipe_and_match_their_names():
                 expected = tuple(row.replace("R", "W").replace("L", "W") for row in published.rows)
                 assert layout.rows == expected
             else:
-                assert layout.rows == find_generated(name).rows
+                assert layout.rows == generated[name].rows
                 assert (split_of(layout) == "train") == (split == "train")
     assert max(maps.values()) == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS
 from icrl4aht_generation.teammates.registry import (
     HEURISTIC_FAMILIES,
     build_teammate,
@@ -32,6 +33,7 @@ def test_missing_or_unknown_parameters_raise_error(family):
         (H1, "refresh_interval", 99.5, r"expected `int`, got `float` - at `\$.refresh_interval`"),
         (H2, "behavior_mode", 6, r"expected `int` <= 5 - at `\$.behavior_mode`"),
         (H2, "shared_margin", True, r"expected `int`, got `bool` - at `\$.shared_margin`"),
+        (H2, RANDOM_ACTIONS, 1.5, r"expected `float` <= 1.0 - at `\$.random_actions`"),
         (H3, "role_mode", -1, r"expected `int` >= 0 - at `\$.role_mode`"),
         (H4, "inertia", None, r"expected `float`, got `null` - at `\$.inertia`"),
     ],

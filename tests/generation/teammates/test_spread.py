@@ -11,18 +11,16 @@ from icrl4aht_generation.teammates import spread as module
 from icrl4aht_generation.teammates.distances import (
     INSTANCE_NAMES,
     act_on_records,
-    common_records,
+    common_states,
     distances_to_tests,
-    instance_policies,
 )
-from icrl4aht_generation.teammates.draws import DIVERSE_DISTANCE, find_draw, read_measured, write_table
+from icrl4aht_generation.teammates.draws import DIVERSE_DISTANCE, find_draw
 from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS, Heuristic, Sampling
 from icrl4aht_generation.teammates.preference import WATCHER
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, check_theta, sample_teammate
 from icrl4aht_generation.teammates.spread import (
     MOST_CHOSEN,
     SPREAD_SEED,
-    SPREAD_TABLE,
     LayoutSpread,
     SpreadTeammate,
     choose_spread,
@@ -35,7 +33,7 @@ from icrl4aht_generation.teammates.spread import (
 
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TESTED_ON
 from icrl4aht_data.benchmark.tasks import teammate_id
-from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
+from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 
 POINTS = np.array([0.0, 0.3, 0.35, 1.0, 0.05])
@@ -110,15 +108,6 @@ def test_spread_table_counts_teammates_and_families(small_spread):
     assert (row["families"], row["least_distance"], row["least_to_tests"]) == ("H1:0 H2:0 H3:0 H4:3", 0.25, 0.4)
 
 
-def test_spread_table_is_read_as_written(small_spread, tmp_path):
-    path = tmp_path / "spread.jsonl"
-    write_table(path, [small_spread])
-    assert read_measured(path, LayoutSpread) == [small_spread]
-    path.write_text(path.read_text("utf-8").replace('"separation"', '"seperation"'), encoding="utf-8")
-    with pytest.raises(TaskFormatError, match=r"spread\.jsonl, line 1: .*seperation"):
-        read_measured(path, LayoutSpread)
-
-
 @pytest.mark.parametrize("layout", TESTED_ON)
 def test_listed_teammates_differ_by_the_least_distance(layout):
     spread = read_spread(layout)
@@ -138,10 +127,6 @@ def test_listed_teammates_differ_by_the_least_distance(layout):
         assert max(returns) - min(returns) >= LEAST_HEADROOM or spread.headroom == 0
 
 
-def test_file_of_spread_teammates_is_small():
-    assert SPREAD_TABLE.stat().st_size < 300_000
-
-
 @pytest.mark.slow
 def test_measured_spread_teammates_match_the_list():
     """Two teammates of one family are measured, so that only this family and the test teammates are compiled."""
@@ -149,8 +134,7 @@ def test_measured_spread_teammates_match_the_list():
     spread = read_spread(layout.name)
     family = "assembly_line"
     chosen = [mate for mate in spread.chosen if mate.family == family and RANDOM_ACTIONS not in mate.theta][:2]
-    records = common_records(layout, 4)
-    tested = act_on_records(layout, instance_policies(layout), records)
+    records, tested = common_states(layout, 4)
     actions = act_on_records(layout, [build_teammate(None, mate.entry) for mate in chosen], records)
     assert (actions[0] != actions[1]).mean() >= DIVERSE_DISTANCE
     for mate, distances in zip(chosen, distances_to_tests(tested, actions), strict=True):
@@ -191,9 +175,3 @@ def test_random_actions_with_fixed_noise_repeat_in_every_episode():
     theta = {"a": 0.5, RANDOM_ACTIONS: 0.5}
     np.testing.assert_array_equal(actions_of(theta, "fixed", 1), actions_of(theta, "fixed", 2))
     assert (actions_of(theta, "seeded", 1) != actions_of(theta, "seeded", 2)).any()
-
-
-def test_probability_of_random_actions_above_1_raises_error():
-    entry = WATCHER | {"theta": WATCHER["theta"] | {RANDOM_ACTIONS: 1.5}}
-    with pytest.raises(TaskFormatError, match=r"expected `float` <= 1.0 - at `\$.random_actions`"):
-        check_theta(entry)

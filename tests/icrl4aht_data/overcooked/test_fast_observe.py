@@ -23,13 +23,13 @@ def test_fast_observe_equals_observe_on_random_states(layout, canonical, dtype):
     """Compare on random states: items, pots, timers, buttons and deliveries are drawn independently."""
     rng = np.random.default_rng(2)
     where = columns(layout)
-    states = rng.integers(0, 256, (3000, record_size(layout))).astype(np.uint8)
-    states[:, where.positions] = rng.choice(np.flatnonzero(layout.walkable), (3000, 2))
+    states = rng.integers(0, 256, (1000, record_size(layout))).astype(np.uint8)
+    states[:, where.positions] = rng.choice(np.flatnonzero(layout.walkable), (1000, 2))
     states[:, where.facings] %= 4
     states[:, where.delivered] %= 2
     states[:, where.pot_timers] %= 32
-    states[:, where.recipe] = rng.choice(layout.recipe_items, 3000)
-    out = np.full((3000, *observation_shape(layout, canonical)), 9, dtype)
+    states[:, where.recipe] = rng.choice(layout.recipe_items, 1000)
+    out = np.full((1000, *observation_shape(layout, canonical)), 9, dtype)
     assert fast_observe(layout, states, out, threads=3, canonical=canonical) is out
     np.testing.assert_array_equal(out, observe(layout, states, 0, canonical))
 

@@ -19,6 +19,7 @@ import pytest
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import INTERACT, STAY
+from icrl4aht_data.overcooked.channels import channel_names
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe, observe_both
 from icrl4aht_data.overcooked.state import columns, faults, pack, record_size, start_record, unpack
@@ -47,30 +48,10 @@ each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 Cells = dict[tuple[int, int], int]
 
 
-def channel_names(n: int, delivery: bool) -> list[str]:
-    """Return the channels in the specification's order, for n ingredient types."""
-    counts = [str(i) for i in range(n)]
-    item = ["plate", "cooked", *counts]
-    agent = ["position", "up", "down", "right", "left", *item]
-    return [
-        *(f"self {what}" for what in agent),
-        *(f"other {what}" for what in agent),
-        *("wall", "goal", "pot", "R", "L", "plates"),
-        *(f"pile {what}" for what in counts),
-        *(f"item {what}" for what in item),
-        *(f"recipe {what}" for what in item),
-        "pot timer",
-        *(["delivery"] if delivery else []),
-    ]
-
-
 def nonzero_channels(layout: Layout, record: np.ndarray, agent: int) -> dict[str, Cells]:
     """Return all nonzero values of an agent's observation, as channel -> map cell (x, y) -> value."""
-    _, _, _, n, channels = SPECIFIED[layout.name]
-    names = channel_names(n, layout.name in ("test_simple", "test_wide"))
-    assert len(names) == channels
-    view = observe(layout, record, agent)[0]
-    assert view.shape == (5, 5, channels)
+    names, view = channel_names(layout), observe(layout, record, agent)[0]
+    assert view.shape == (5, 5, len(names))
     position = int(unpack(layout, record).positions[0, agent])
     left, top = position % layout.width - 2, position // layout.width - 2
     found: dict[str, Cells] = {}
@@ -158,25 +139,25 @@ def test_observation_of_a_scene_has_the_expected_nonzero_channels():
         counters={(1, 0): ONE, (0, 2): PLATE, (2, 3): PLATE + COOKED + 3 * ONE},
     )
     assert nonzero_channels(CRAMPED, record, 0) == {
-        "self position": cell_values(1, (1, 1)),
-        "self left": cell_values(1, (1, 1)),
-        "self 0": cell_values(1, (1, 1)),
-        "other position": cell_values(1, (3, 2)),
-        "other down": cell_values(1, (3, 2)),
-        "other plate": cell_values(1, (3, 2)),
-        "other cooked": cell_values(1, (3, 2)),
-        "other 0": cell_values(2, (3, 2)),
-        "other 1": cell_values(1, (3, 2)),
+        "self_position": cell_values(1, (1, 1)),
+        "self_facing_left": cell_values(1, (1, 1)),
+        "self_ingredient_0": cell_values(1, (1, 1)),
+        "other_position": cell_values(1, (3, 2)),
+        "other_facing_down": cell_values(1, (3, 2)),
+        "other_plate": cell_values(1, (3, 2)),
+        "other_cooked": cell_values(1, (3, 2)),
+        "other_ingredient_0": cell_values(2, (3, 2)),
+        "other_ingredient_1": cell_values(1, (3, 2)),
         "wall": cell_values(1, (0, 0), (1, 0), (3, 0), (0, 2), (0, 3), (2, 3)),
         "goal": cell_values(1, (3, 3)),
         "pot": cell_values(1, (2, 0)),
-        "plates": cell_values(1, (1, 3)),
-        "pile 0": cell_values(1, (0, 1)),
-        "item plate": cell_values(1, (0, 2), (2, 3)),
-        "item cooked": cell_values(1, (2, 3)),
-        "item 0": cell_values(2, (2, 0)),
-        "item 1": {(1, 0): 1, (2, 0): 1, (2, 3): 3},
-        "pot timer": cell_values(13, (2, 0)),
+        "plate_pile": cell_values(1, (1, 3)),
+        "pile_0": cell_values(1, (0, 1)),
+        "item_plate": cell_values(1, (0, 2), (2, 3)),
+        "item_cooked": cell_values(1, (2, 3)),
+        "item_ingredient_0": cell_values(2, (2, 0)),
+        "item_ingredient_1": {(1, 0): 1, (2, 0): 1, (2, 3): 3},
+        "pot_timer": cell_values(13, (2, 0)),
     }
 
 
@@ -193,9 +174,8 @@ def test_delivery_channel_marks_the_goal_for_one_step(layout, goal, poses, deliv
     after = rules.step(layout, record, np.array([actions]), next_recipe)
     assert after.reward == 20
     assert nonzero_channels(layout, after.state, deliverer)["delivery"] == cell_values(1, goal)
-    assert "delivery" not in nonzero_channels(
-        layout, after.state, 1 - deliverer
-    )  # the goal is outside the other agent's window
+    # The goal is outside the other agent's window.
+    assert "delivery" not in nonzero_channels(layout, after.state, 1 - deliverer)
     later = rules.step(layout, after.state, np.array([[STAY, STAY]]), next_recipe)
     assert "delivery" not in nonzero_channels(layout, later.state, deliverer)
 
@@ -282,6 +262,5 @@ def test_faults_lists_several_faults_of_one_state():
 @each_layout
 def test_shows_recipe_tells_whether_observations_contain_the_recipe(layout):
     views = observe(layout, random_records(layout, 500, np.random.default_rng(0)), 0)
-    names = channel_names(layout.ingredient_types, layout.indicates_delivery)
-    shown = [number for number, name in enumerate(names) if name.startswith("recipe")]
+    shown = [number for number, name in enumerate(channel_names(layout)) if name.startswith("recipe_ingredient")]
     assert layout.shows_recipe == bool(views[..., shown].any())

@@ -80,16 +80,10 @@ def scene(slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: P
     return state_record(layout, aside, at, hands=[0, hand], **fields)
 
 
-def after_action(
-    slot: int, record: np.ndarray, action: int, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111
-) -> Scene:
-    """Return the scene after one step in which agent `slot` acts and the other agent stays."""
-    ego, teammate = (action, STAY) if slot == 0 else (STAY, action)
-    return act(layout, record, ego, teammate, next_recipe)
-
-
 def interact(slot: int, record: np.ndarray, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111) -> Scene:
-    return after_action(slot, record, INTERACT, layout, next_recipe)
+    """Return the scene after one step in which agent `slot` interacts and the other agent stays."""
+    ego, teammate = (INTERACT, STAY) if slot == 0 else (STAY, INTERACT)
+    return act(layout, record, ego, teammate, next_recipe)
 
 
 # Tests of movement
@@ -215,10 +209,6 @@ def test_ego_interacts_before_the_teammate_at_a_shared_pot(hands, pot, hands_aft
 # Tests of shaped rewards, which each agent gets in addition to the team reward
 
 
-def reward_of_slot(slot: int, value: float) -> list[float]:
-    return [value, 0] if slot == 0 else [0, value]
-
-
 # asymm_both has pots at (4, 2) and (4, 3), and piles of plates at (3, 4) and (5, 4)
 
 AT_PLATES_ASYMM = ((3, 3, "down"), (5, 3, "down"))
@@ -245,4 +235,4 @@ def test_taking_a_plate_earns_a_shaped_reward_of_3_if_a_pot_needs_a_plate(slot, 
     record = state_record(ASYMM, poses[0], poses[1], hands=hands, pot_items=pots, counters=counters)
     after = interact(slot, record, ASYMM)
     assert (after.hands[slot], after.reward) == (PLATE, 0)
-    assert after.shaped == reward_of_slot(slot, reward)
+    assert after.shaped == ([reward, 0] if slot == 0 else [0, reward])

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+from functools import partial
+
+import jax
 import numpy as np
 import pytest
 
 from icrl4aht_data.overcooked.cells import CENTRE, VISIBLE
+from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns, record_size
@@ -26,17 +29,17 @@ def example_records(layout: Layout) -> np.ndarray:
 @each_layout
 @pytest.mark.parametrize("agent", [0, 1])
 def test_channels_of_words_equal_the_observation(layout, agent):
-    records, words = example_records(layout), cell_words([layout])
+    records, words = example_records(layout), cell_words((layout,))
     expected = observe(layout, records, agent)
     ids = words.ids(records, agent=agent)
     assert ids.dtype == np.int32
     np.testing.assert_array_equal(words.channels[ids].reshape(expected.shape), expected)
-    np.testing.assert_array_equal(np.asarray(words.ids(jnp.asarray(records), agent=agent)), ids)
+    np.testing.assert_array_equal(jax.jit(partial(words.ids, agent=agent))(records), ids)
 
 
 @each_layout
 def test_entries_include_all_nonzero_values_of_observations(layout):
-    records, words = example_records(layout), cell_words([layout])
+    records, words = example_records(layout), cell_words((layout,))
     seen = [np.flatnonzero(observe(layout, records, agent).reshape(len(records), -1).any(axis=0)) for agent in (0, 1)]
     assert np.isin(seen[0], words.entries((0,))).all()
     assert np.isin(seen[1], words.entries((1,))).all()
@@ -45,30 +48,22 @@ def test_entries_include_all_nonzero_values_of_observations(layout):
     assert len(words.entries((0,))) < VISIBLE * layout.channels / 2
 
 
-@pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
-def test_words_of_several_layouts_in_one_batch_equal_observations(xp):
-    layouts = [get_layout(name) for name in ("asymm_both", "cramped_up", "asymm_right", "cramped_down")]
-    words, number = cell_words(layouts), np.array([2, 0, 3, 1, 1])
-    mixed, expected = np.zeros((5, 6, 64), np.uint8), np.zeros((5, 6, *layouts[0].obs_shape), np.uint8)
+@pytest.mark.parametrize("canonical", [False, True], ids=["own", "canonical"])
+def test_words_of_several_layouts_in_one_batch_equal_observations(canonical):
+    """Use four layouts with equal channels, or canonical channels and all layouts."""
+    names = LAYOUTS if canonical else ("asymm_both", "cramped_up", "asymm_right", "cramped_down")
+    layouts = tuple(map(get_layout, names))
+    words, size = cell_words(layouts, canonical), max(map(record_size, layouts))
+    number = np.array([2, *range(len(layouts))[::-1]])
+    mixed = np.zeros((len(number), 40, size), np.uint8)
+    expected = np.zeros((len(number), 40, *observation_shape(layouts[0], canonical)), np.uint8)
     for row, layout in enumerate(layouts[n] for n in number):
-        records = example_records(layout)[: 6 * 7 : 7]
-        mixed[row, :, : records.shape[-1]], expected[row] = records, observe(layout, records, 0)
-    size = max(np.flatnonzero(mixed.any(axis=(0, 1)))) + 1
-    ids = words.ids(xp.asarray(mixed[..., :size]), xp.asarray(number))
-    np.testing.assert_array_equal(words.channels[np.asarray(ids)].reshape(expected.shape), expected)
-
-
-def test_words_of_all_layouts_equal_canonical_observations():
-    layouts = list(LAYOUTS.values())
-    words, size = cell_words(layouts, canonical=True), max(map(record_size, layouts))
-    mixed = np.zeros((len(layouts), 40, size), np.uint8)
-    expected = np.zeros((len(layouts), 40, 5, 5, 46), np.uint8)
-    for row, layout in enumerate(layouts):
         records = example_records(layout)[::20]
-        mixed[row, :, : records.shape[-1]], expected[row] = records, observe(layout, records, 0, canonical=True)
-    ids = words.ids(mixed, np.arange(len(layouts)))
+        mixed[row, :, : records.shape[-1]], expected[row] = records, observe(layout, records, 0, canonical)
+    ids = words.ids(mixed, number)
     np.testing.assert_array_equal(words.channels[ids].reshape(expected.shape), expected)
-    seen = np.flatnonzero(expected.reshape(-1, VISIBLE * 46).any(axis=0))
+    np.testing.assert_array_equal(jax.jit(words.ids)(mixed, number), ids)
+    seen = np.flatnonzero(expected.reshape(-1, VISIBLE * expected.shape[-1]).any(axis=0))
     assert np.isin(seen, words.entries()).all()
     assert len(words.channels) < 700
 
@@ -76,7 +71,7 @@ def test_words_of_all_layouts_equal_canonical_observations():
 @pytest.mark.parametrize(("column", "value"), [("pot_timers", 31), ("pot_items", 255), ("hands", 255)])
 def test_impossible_contents_map_to_the_last_word(column, value):
     layout = get_layout("cramped_up")
-    records, words = example_records(layout), cell_words([layout])
+    records, words = example_records(layout), cell_words((layout,))
     records[:, getattr(columns(layout), column)] = value
     ids = words.ids(records)
     impossible = len(words.channels) - 1

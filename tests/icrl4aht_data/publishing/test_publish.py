@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import hashlib
 import json
 import re
 import warnings
@@ -15,17 +14,13 @@ import pytest
 import yaml
 
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.errors import OptionError, ReleaseError
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.writing.convert import to_release
-from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.commands import run_cli
 from tests.helpers.paths import ROOT
-from tests.helpers.random_releases import random_history, random_release
+from tests.helpers.random_releases import random_release
 from tests.helpers.spoiled import read_lines
 
 DAY = datetime.date(2026, 1, 2)
@@ -43,37 +38,6 @@ def release(tmp_path_factory) -> Path:
 def published_release(release, tmp_path_factory) -> Path:
     """Return the fixture `release`, built for publication (read-only)."""
     return build_release(release, tmp_path_factory.mktemp("published") / "release", published=DAY)
-
-
-@pytest.fixture(scope="session")
-def release_with_learned_teammate(tmp_path_factory) -> Path:
-    """Return a release of one task with a learned teammate and its checkpoint (read-only)."""
-    folder = tmp_path_factory.mktemp("learned")
-    weights = folder / "policy.safetensors"
-    weights.write_bytes(b"weights")
-    digest = hashlib.sha256(b"weights").hexdigest()
-    facts = {
-        "algorithm": "fcp",
-        "layout": "demo_wide",
-        "member": 1,
-        "checkpoint": 4,
-        "step": 4000,
-        "seed": 0,
-        "code_version": "0.1.0",
-        "agents": [0, 1],
-        "return": 40.0,
-        "teammate_return": 35.5,
-        "return_of": "16 episodes",
-        "widths": {"pointwise": [4], "gru": 8},
-    }
-    (folder / "policy.json").write_text(json.dumps(facts))
-    theta = {"checkpoint": "demo_wide/fcp/m1/c4", "sha256": digest}
-    teammate = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0, "theta": theta}
-    task = make_task("teammate", "train", "demo_wide", teammate, 0)
-    arrays = random_history(get_layout("demo_wide"), 6, 20, np.random.default_rng(0))
-    files = {f"teammates/{digest}/{path.name}": path for path in (weights, folder / "policy.json")}
-    new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)], files)
-    return write_release(folder / "release", "lite", [new], data_version="0.0.1", kept_steps=20)
 
 
 def front_matter(card: str) -> dict:
@@ -177,8 +141,8 @@ def test_the_card_describes_the_release(published_release):
     assert facts["license"] == "mit"
     assert facts["task_categories"] == ["reinforcement-learning"]
     assert [config["config_name"] for config in facts["configs"] if config.get("default")] == ["default"]
-    files = {name for config in facts["configs"] for name in config["data_files"] for name in [name["path"]]}
-    assert all(list(published_release.glob(pattern)) for pattern in files)
+    patterns = [file["path"] for config in facts["configs"] for file in config["data_files"]]
+    assert all(list(published_release.glob(pattern)) for pattern in patterns)
     assert "12 histories of 6 tasks, 1,440 transitions; each history has 120 steps." in card
     assert re.search(r"\| coord_simple \| train \| \S+ to \S+ \(4\) \|", card)
     assert "coord_simple/H4. `cards/headroom.md`" in card, "no cell of cramped_down"
@@ -194,19 +158,23 @@ def test_code_snippets_of_the_card_run(published_release, monkeypatch):
         exec(snippet.replace("path/of/this/folder", str(published_release)), {})
 
 
-def test_build_release_accepts_learned_teammates(release_with_learned_teammate, tmp_path):
-    out = build_release(release_with_learned_teammate, tmp_path / "out")
+def test_build_release_accepts_learned_teammates(tmp_path):
+    part = load_icrl4aht(teammate_family="rl", teammate_kind="fcp")[:1]
+    out = build_release(to_release(part, tmp_path / "source", "lite"), tmp_path / "out")
     report = verify_release(out, level="deep")
-    assert report.ok and not report.notes, report
+    assert report.ok, report
+    assert [note.split(",")[0] for note in report.notes] == ["returns of reference egos", "nearest test teammates"]
     card = (out / "README.md").read_text()
     assert "policies learned by fcp, which act greedily" in card
     assert "in place of the learned teammates" not in card
     assert verify_release(build_release(out, tmp_path / "again")).ok
 
 
-def test_build_release_accepts_releases_of_observations(release, tmp_path):
-    source = to_release(load_icrl4aht(release), tmp_path / "source", "observations")
-    out = build_release(source, tmp_path / "out")
+def test_release_build_command_accepts_releases_of_observations(release, tmp_path):
+    source, out = to_release(load_icrl4aht(release), tmp_path / "source", "observations"), tmp_path / "out"
+    summary = json.loads(run_cli("release", "build", "--json", source, "--out", out))
+    assert set(summary["files"]) == set(read_manifest(out))
+    assert summary["bytes"] > 10_000
     assert verify_release(out).ok
     card = (out / "README.md").read_text()
     assert "without state records nothing can be replayed" in card
@@ -214,11 +182,3 @@ def test_build_release_accepts_releases_of_observations(release, tmp_path):
     assert not (out / "episodes").exists()
     assert [config["config_name"] for config in front_matter(card)["configs"]][-1] == "cramped_down"
     assert "`state`" not in card
-
-
-def test_release_build_command_prints_the_built_files(release, tmp_path):
-    out = tmp_path / "out"
-    printed = run_cli("release", "build", "--json", release, "--out", out)
-    summary = json.loads(printed)
-    assert set(summary["files"]) == set(read_manifest(out))
-    assert summary["bytes"] > 10_000

@@ -85,19 +85,16 @@ def test_an_upload_is_complete_and_tagged(hub, published_release, tmp_path):
     assert verify_release(copy).ok
 
 
-def test_a_second_upload_sends_nothing(hub, published_release):
+def test_second_upload_sends_nothing_and_other_content_is_refused(hub, published_release, tmp_path):
     first = upload_release(published_release, ADDRESS)
     hub.log.clear()
     printed = run_cli("upload", published_release, ADDRESS)
     assert f"already there, {len(first.files)} files" in printed
     assert f"tag v0.0.1 is commit {first.commit}" in printed
     assert {request.method for request in hub.log} == {"GET"}
-
-
-def test_upload_of_other_content_for_an_existing_tag_is_refused(hub, published_release, tmp_path):
-    first = upload_release(published_release, ADDRESS)
-    random_release(tmp_path / "source", streams=2, seed=1)
-    other = build_release(tmp_path / "source", tmp_path / "other")
+    other = shutil.copytree(published_release, tmp_path / "other")
+    (other / "LICENSE").write_text("all rights reserved")
+    write_manifest(other)
     with pytest.raises(
         UploadError, match=r"us/histories: tag v0\.0\.1 exists with other content: .*another data version"
     ):
@@ -108,6 +105,8 @@ def test_upload_of_other_content_for_an_existing_tag_is_refused(hub, published_r
 def test_upload_of_a_new_version_replaces_the_old_files(hub, published_release, tmp_path):
     first = upload_release(published_release, ADDRESS)
     new = next_version(published_release, tmp_path / "new")
+    with pytest.raises(UploadError, match="us/histories is a public repository; make it private"):
+        upload_release(new, ADDRESS, private=True)
     looked = upload_release(new, ADDRESS, dry_run=True)
     assert looked.deletes == ["figures/layouts.png"]
     assert any("would delete  figures/layouts.png" in line for line in looked.report_lines())
@@ -127,12 +126,6 @@ def test_repositories_with_foreign_files_are_refused(hub, published_release, tmp
         with pytest.raises(UploadError, match=r"contains 1 file outside any release, such as thesis\.txt"):
             upload_release(published_release, ADDRESS, dry_run=dry_run)
     assert hub.files(REPO) == {"thesis.txt": b"years"}
-
-
-def test_a_public_repository_is_refused_for_a_private_upload(hub, published_release, tmp_path):
-    upload_release(published_release, ADDRESS)
-    with pytest.raises(UploadError, match="us/histories is a public repository; make it private"):
-        upload_release(next_version(published_release, tmp_path / "new"), ADDRESS, private=True)
 
 
 def test_an_invalid_release_is_not_uploaded(hub, damaged):

@@ -160,11 +160,11 @@ def test_memory_use_stays_constant_over_many_batches(lite, cache):
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
     sampler = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8", cache=cache).ad(batch_size=16, length=100)
-    with sampler.batches(stop=600) as batches:
-        for _ in range(200):
+    with sampler.batches(stop=200) as batches:
+        for _ in range(100):
             next(batches)
         early = resident_bytes()
         for _ in batches:
             pass
-    assert batches.served == 600
+    assert batches.served == 200
     assert resident_bytes() - early < 16 * 2**20

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ class TestCaches:
                 for threads in (1, 3)
             )
             for sampler, *others in zip(*all_samplers, strict=True):
-                for i in (0, 1, 77):
+                for i in (0, 77):
                     for other in others:
                         assert_equal(sampler[i], other[i])
                 assert_equal(pickle.loads(pickle.dumps(others[-1]))[5], sampler[5])
@@ -67,15 +67,9 @@ class TestCaches:
 
     def test_threads_can_share_a_sampler(self, lite):
         sampler = load_icrl4aht(lite[0], layout="demo_wide", cache="stream", threads=2).ad(batch_size=9, length=30)
-        found = {}
-        workers = [threading.Thread(target=lambda k=k: found.update({k: sampler[k % 4]})) for k in range(12)]
-        for worker in workers:
-            worker.start()
-        for worker in workers:
-            worker.join()
-        assert len(found) == 12
-        for k, batch in found.items():
-            assert_equal(batch, sampler[k % 4])
+        with ThreadPoolExecutor(12) as pool:
+            for k, batch in enumerate(pool.map(lambda k: sampler[k % 4], range(12))):
+                assert_equal(batch, sampler[k % 4])
 
 
 @pytest.mark.parametrize("cache", CACHES)
@@ -190,10 +184,8 @@ class TestOptions:
             assert abs(statistic - freedom) < 5 * np.sqrt(2 * freedom), (counts.shape, statistic)
 
 
-class TestBuffers:
-    @pytest.mark.parametrize("kind", ["lite", "twin"])
-    def test_batch_is_written_into_the_given_buffers(self, lite, reconverted_release, kind):
-        root = lite[0] if kind == "lite" else reconverted_release
+def test_batch_is_written_into_the_given_buffers(lite, reconverted_release):
+    for root in (lite[0], reconverted_release):
         for sampler in samplers(load_icrl4aht(root, layout="demo_wide", obs="uint8")):
             out = sampler.empty()
             for array in out:

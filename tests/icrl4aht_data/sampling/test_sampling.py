@@ -128,15 +128,10 @@ def _rows(arrays, *names):
 
 
 def _transitions(arrays):
-    following = _next_states(arrays)
-    return _rows(arrays | {"following": following}, "state", "following", "actions", "teammate_actions", "rewards")
-
-
-def _next_states(arrays):
-    """Return the state after each step within its episode."""
-    following = np.concatenate([arrays["state"][1:], arrays["state"][:1]])
+    """Return each step's values, with the state after the step in its episode, as a hashable tuple."""
+    following = np.roll(arrays["state"], -1, axis=0)
     following[arrays["dones"]] = arrays["episode_end_state"]
-    return following
+    return _rows(arrays | {"following": following}, "state", "following", "actions", "teammate_actions", "rewards")
 
 
 def _is_slice(window, states):

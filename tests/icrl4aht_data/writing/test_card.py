@@ -15,23 +15,11 @@ from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import LeftOutTask, make_info
-from icrl4aht_data.format.provenance import (
-    ExpertLabels,
-    NearestTest,
-    Provenance,
-    ReferenceEgos,
-)
+from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, HISTORIES, INFO, PROVENANCE, TASKS
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.utils.files import write_json
-from icrl4aht_data.writing.card import (
-    card_facts,
-    card_texts,
-    episode_texts,
-    rai_texts,
-    render_card,
-    write_card,
-)
+from icrl4aht_data.writing.card import card_facts, card_texts, episode_texts, rai_texts, render_card, write_card
 
 KINDS_OF = {family: kind for kind, family in HEURISTIC_KINDS.items()}
 LEFT_OUT = LeftOutTask("task", "demo_wide", "H1/t3", "ppo", 2, 128, 1.25, 2.5, "the learners did not learn")

@@ -86,26 +86,22 @@ def test_a_release_is_not_written_over_its_source(lite, write):
             write(dataset, target, overwrite=True)
 
 
-def as_any(value: Any) -> Any:
-    return value
-
-
 @pytest.mark.parametrize(
     "call",
     [
-        lambda ds: to_release(ds, as_any(3), "lite"),
-        lambda ds: to_release(ds, "out", as_any("heavy")),
-        lambda ds: to_published(ds, as_any(None)),
-        lambda ds: to_minari(ds, as_any(b"out-v0")),
-        lambda ds: to_parquet(ds, as_any(3.5)),
-        lambda ds: from_published(as_any(None), "out"),
-        lambda ds: from_published("files", "out", kept_steps=as_any("many")),
+        lambda ds: to_release(ds, 3, "lite"),  # type: ignore[arg-type]
+        lambda ds: to_release(ds, "out", "heavy"),  # type: ignore[arg-type]
+        lambda ds: to_published(ds, None),  # type: ignore[arg-type]
+        lambda ds: to_minari(ds, b"out-v0"),  # type: ignore[arg-type]
+        lambda ds: to_parquet(ds, 3.5),  # type: ignore[arg-type]
+        lambda ds: from_published(None, "out"),  # type: ignore[arg-type]
+        lambda ds: from_published("files", "out", kept_steps="many"),  # type: ignore[arg-type]
         lambda ds: combine_releases("out", str(ds.root)),
-        lambda ds: combine_releases("out", [ds.root], as_any(5)),
-        lambda ds: combine_releases(as_any(["out"]), [ds.root]),
-        lambda ds: build_release(ds.root, as_any(5)),
-        lambda ds: upload_release(ds.root, as_any(None)),
-        lambda ds: verify_release(ds.root, level=as_any(3)),
+        lambda ds: combine_releases("out", [ds.root], 5),  # type: ignore[arg-type]
+        lambda ds: combine_releases(["out"], [ds.root]),  # type: ignore[arg-type]
+        lambda ds: build_release(ds.root, 5),  # type: ignore[arg-type]
+        lambda ds: upload_release(ds.root, None),  # type: ignore[arg-type]
+        lambda ds: verify_release(ds.root, level=3),  # type: ignore[arg-type]
     ],
 )
 def test_wrong_arguments_raise_package_errors(lite, tmp_path, monkeypatch, call):

@@ -65,46 +65,47 @@ def test_streamed_rows_equal_the_episodes(built_release, dataset, split):
             assert records.shape[-1] == WIDTH and not records[..., size:].any()
 
 
-class TestObservations:
-    @pytest.mark.parametrize("obs", ["float32", "uint8"])
-    @pytest.mark.parametrize("channels", ["own", "canonical"])
-    def test_rendered_observations_equal_those_of_the_histories(self, built_release, dataset, channels, obs):
-        """Render an episode from a single row of Python lists, and several from a batch of arrays."""
-        opened = dataset.filter(split="train").with_options(obs=obs, channels=channels)
-        for layout in opened.layouts:
-            expected = [episode.obs for history in opened.filter(layout=layout.name) for episode in history.episodes]
-            rows = stream_episodes(built_release, "train").filter(lambda row, name=layout.name: row["layout"] == name)
-            for seen, row in zip(expected, rows, strict=True):
-                found = render_observations(row, channels=channels, obs=obs)
-                assert found.dtype == obs
-                np.testing.assert_array_equal(found, seen)
-            (batch,) = rows.with_format("numpy").batch(1000)
-            np.testing.assert_array_equal(render_observations(batch, channels=channels, obs=obs), expected)
+@pytest.mark.parametrize("obs", ["float32", "uint8"])
+@pytest.mark.parametrize("channels", ["own", "canonical"])
+def test_rendered_observations_equal_those_of_the_histories(built_release, dataset, channels, obs):
+    """Render an episode from a single row of Python lists, and several from a batch of arrays."""
+    opened = dataset.filter(split="train").with_options(obs=obs, channels=channels)
+    for layout in opened.layouts:
+        expected = [episode.obs for history in opened.filter(layout=layout.name) for episode in history.episodes]
+        rows = stream_episodes(built_release, "train").filter(lambda row, name=layout.name: row["layout"] == name)
+        for seen, row in zip(expected, rows, strict=True):
+            found = render_observations(row, channels=channels, obs=obs)
+            assert found.dtype == obs
+            np.testing.assert_array_equal(found, seen)
+        (batch,) = rows.with_format("numpy").batch(1000)
+        np.testing.assert_array_equal(render_observations(batch, channels=channels, obs=obs), expected)
 
-    def test_rows_of_several_layouts_need_canonical_channels(self, built_release, dataset):
-        by_layout = {row["layout"]: row for row in stream_episodes(built_release, "train")}
-        assert len(by_layout) > 1
-        rows = list(by_layout.values())
-        assert render_observations(rows, channels="canonical").shape == (len(rows), STEPS, 5, 5, 46)
-        with pytest.raises(OptionError, match=r'expected one shape, found .*: give .* use channels="canonical"'):
-            render_observations(rows)
 
-    def test_invalid_rows_raise_errors(self, built_release):
-        row = next(iter(stream_episodes(built_release, "train")))
-        wrong: list[tuple[type[Exception], str, Any, dict[str, Any]]] = [
-            (UnknownNameError, "unknown channels", row, {"channels": "all"}),
-            (OptionError, "found none: give at least one row", [], {}),
-            (
-                OptionError,
-                r"state: expected .* S at least \d+, found \(1, 20, 3\)",
-                row | {"state": np.zeros((20, 3))},
-                {},
-            ),
-            (NotStoredError, "without a column 'state'.* use hf_windows", {"layout": "demo_wide"}, {}),
-        ]
-        for kind, message, rows, options in wrong:
-            with pytest.raises(kind, match=message):
-                render_observations(rows, **options)
+def test_rows_of_several_layouts_need_canonical_channels(built_release, dataset):
+    by_layout = {row["layout"]: row for row in stream_episodes(built_release, "train")}
+    assert len(by_layout) > 1
+    rows = list(by_layout.values())
+    assert render_observations(rows, channels="canonical").shape == (len(rows), STEPS, 5, 5, 46)
+    with pytest.raises(OptionError, match=r'expected one shape, found .*: give .* use channels="canonical"'):
+        render_observations(rows)
+
+
+def test_invalid_rows_raise_errors(built_release):
+    row = next(iter(stream_episodes(built_release, "train")))
+    wrong: list[tuple[type[Exception], str, Any, dict[str, Any]]] = [
+        (UnknownNameError, "unknown channels", row, {"channels": "all"}),
+        (OptionError, "found none: give at least one row", [], {}),
+        (
+            OptionError,
+            r"state: expected .* S at least \d+, found \(1, 20, 3\)",
+            row | {"state": np.zeros((20, 3))},
+            {},
+        ),
+        (NotStoredError, "without a column 'state'.* use hf_windows", {"layout": "demo_wide"}, {}),
+    ]
+    for kind, message, rows, options in wrong:
+        with pytest.raises(kind, match=message):
+            render_observations(rows, **options)
 
 
 def test_hf_episodes_have_the_same_rows_as_streamed_files(built_release, dataset, tmp_path, monkeypatch):

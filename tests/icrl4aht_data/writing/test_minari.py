@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import gymnasium
 import minari
 import numpy as np
@@ -65,22 +63,17 @@ def test_minari_dataset_of_one_task_recovers_its_environment(tmp_path):
     assert env.observation_space.shape == (5, 5, 45)
 
 
-def test_minari_metadata_contains_tasks_and_provenance(lite, minari_folder):
-    about = json.loads((minari_folder / "data" / "metadata.json").read_text())["icrl4aht"]
-    release = load_icrl4aht(lite[0])
-    assert (about["data_version"], about["kept_steps"]) == ("0.0.1", STEPS)
-    assert [about["histories"][entry.history_id]["task_id"] for entry in release.entries] == release.column(
-        "task_id"
-    ).tolist()
-    assert {task["task_id"] for task in about["tasks"]} == about["provenance"].keys() == set(release.column("task_id"))
-
-
-def test_minari_metadata_explains_why_no_environment_is_stored(minari_folder):
-    opened = minari.MinariDataset(minari_folder / "data")
+def test_minari_metadata_contains_tasks_and_provenance_and_no_environment(lite, minari_folder):
+    opened, release = minari.MinariDataset(minari_folder / "data"), load_icrl4aht(lite[0])
     assert opened.env_spec is None
     shown = opened.storage.metadata
     assert shown["author"] == {"The icrl4aht-data authors"} and shown["dataset_size"] > 0
     assert "4 tasks; there is no single environment to recover" in shown["description"]
+    about = shown["icrl4aht"]
+    assert (about["data_version"], about["kept_steps"]) == ("0.0.1", STEPS)
+    names = release.column("task_id").tolist()
+    assert [history["task_id"] for history in about["histories"]] == names
+    assert {task["task_id"] for task in about["tasks"]} == about["provenance"].keys() == set(names)
 
 
 def test_convert_command_writes_and_overwrites_minari_datasets(lite, tmp_path):

@@ -5,6 +5,7 @@ A hostile release has matching hashes, unless the case concerns the manifest or 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -263,15 +264,11 @@ for _file in (INFO, SHARD, policy_path):
 
 
 def deep_folder(root: Path) -> None:
-    working_directory = Path.cwd()
-    os.chdir(root / "meta")
-    try:
+    with contextlib.chdir(root / "meta"):
         for _ in range(1500):
             Path("d").mkdir()
             os.chdir("d")
         Path("file").touch()
-    finally:
-        os.chdir(working_directory)
 
 
 _folders = ("data", "meta")
@@ -310,15 +307,8 @@ add_hashed("malformed", {"info: deep": replaced(INFO, deep_json(100_000)), "info
 add_hashed("SemVer", {"info: version with terminal codes": change_info(data_version="\x1b[2J")})
 
 
-def nested_lists(levels: int) -> list:
-    """Return lists nested `levels` deep."""
-    value: list = []
-    for _ in range(levels):
-        value = [value]
-    return value
-
-
-_deep_theta = change_lines(lambda values: values[0]["teammate"]["theta"].update(x=nested_lists(400)), TASKS)
+_nested = json.loads("[" * 400 + "]" * 400)
+_deep_theta = change_lines(lambda values: values[0]["teammate"]["theta"].update(x=_nested), TASKS)
 _deep_files = {f"deep: {name}": replaced(name, deep_json(500)) for name in (INFO, PROVENANCE)}
 add_hashed("found more levels", _deep_files | {"tasks: deep theta": _deep_theta})
 _endless_line = file_with(b"a" * 2**24)

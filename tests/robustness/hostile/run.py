@@ -15,12 +15,13 @@ from typing import Any
 import h5py
 import numpy as np
 
-from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data import clients, load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS, TEAMMATES
+from icrl4aht_data.utils import files
 from icrl4aht_data.utils.files import file_hash, files_below
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
@@ -181,8 +182,10 @@ def make_valid_inputs(folder: Path) -> None:
 
 
 def bound_process() -> None:
-    """Limit the memory of this process permanently, and turn warnings into errors."""
+    """Limit the memory, the size of downloads and the waits before retries of this process; warnings are errors."""
     warnings.simplefilter("error")
+    clients._WAITS = (0.01, 0.01, 0.01)
+    files.LARGEST = LARGE
     _BOUND.enter_context(memory_limit(MEMORY))
 
 

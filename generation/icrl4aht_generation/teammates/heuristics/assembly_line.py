@@ -109,10 +109,8 @@ def _first_nonempty(mask: Bool[Array, " cells"], other: Bool[Array, " cells"]) -
 
 def _should_step_aside(scene: Scene) -> Bool[Array, ""]:
     """Return whether agent 1 has empty hands and is adjacent to a partner who carries an item."""
-    if scene.slot == 0:
-        return jnp.asarray(False)
     adjacent = scene.manhattan(scene.me, scene.partner) == 1
-    return scene.holds_nothing & (scene.partner_hand > 0) & adjacent
+    return scene.holds_nothing & (scene.partner_hand > 0) & adjacent & (scene.slot == 1)
 
 
 def _step_aside(scene: Scene) -> Int[Array, ""]:

@@ -22,7 +22,7 @@ from icrl4aht_generation.teammates.heuristics.heuristic import (
 )
 
 _CRAMPED_CELLS = 8
-"""Maximum number of floor cells of a cramped layout."""
+"""Maximum number of floor cells of a cramped layout, on which agents give way to their partner."""
 
 _NONE = -1
 _NEVER = -1000
@@ -78,7 +78,7 @@ def _choose_action(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[
     specialist = params["task_specialization"] > 0.5
     cooks_only, delivers_only = specialist & (scene.slot == 0), specialist & (scene.slot == 1)
     empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
-    cramped = is_cramped(scene)
+    cramped = jnp.sum(jnp.asarray(scene.tables.walkable)) <= _CRAMPED_CELLS
     # On a cramped layout only agent 1 gives way.
     second = cramped & (scene.slot == 1)
     ids = jnp.asarray(scene.tables.ingredients)
@@ -174,11 +174,6 @@ def _blocking_step(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
 
 
 # The functions below are for cramped layouts.
-
-
-def is_cramped(scene: Scene) -> Bool[Array, ""]:
-    """Return whether a layout is so small that H1 teammates give way to their partner."""
-    return jnp.sum(jnp.asarray(scene.tables.walkable)) <= _CRAMPED_CELLS
 
 
 def _step(scene: Scene, target: Int[Array, ""], cramped: Bool[Array, ""]) -> Int[Array, ""]:

@@ -1,0 +1,101 @@
+"""Jobs of a queue that train a model, measure it and store the result, see `icrl4aht_generation.jobs.job.Job`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any
+
+from icrl4aht_generation.jobs.job import OnUpdate
+from icrl4aht_generation.learners.resume import TIMING, differing_settings, last_line, run_lock
+
+from icrl4aht_baselines.training.options import TrainOptions
+from icrl4aht_baselines.training.trainer import StepProgress
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+
+
+class TrainingJob(ABC):
+    """Base class of jobs that train a model and measure it.
+
+    Attributes:
+        seed: seed of the training run.
+        options: settings with the attributes `training`, a function from the seed to the settings of the trainer, and
+            `steps_per_update`, the number of environment or history steps of a training step.
+        out: folder of all jobs.
+        xla_threads, is_quick: see `Job`.
+    """
+
+    seed: int
+    options: Any
+    out: Path
+    xla_threads: int | None = 1
+    is_quick: bool = False
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """Unique name of the job in its queue, which is also the name of its folder."""
+
+    @property
+    @abstractmethod
+    def settings(self) -> dict[str, Any]:
+        """All settings that the result depends on, as JSON."""
+
+    @abstractmethod
+    def measure(self, on_update: OnUpdate) -> dict[str, Any]:
+        """Train the model, and return the measured values, as JSON."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the training run and of its result."""
+        return self.out / self.name
+
+    @property
+    def run_folder(self) -> Path:
+        """Folder of the training run."""
+        return self.folder / "run"
+
+    @property
+    def result_file(self) -> Path:
+        """Path of the file with the result of the finished job."""
+        return self.folder / "result.json"
+
+    @property
+    def training(self) -> TrainOptions:
+        """Settings of the training run, for the trainer."""
+        return self.options.training(self.seed)
+
+    @property
+    def updates(self) -> int:
+        """Number of training steps."""
+        return self.training.steps
+
+    def is_finished(self) -> bool:
+        """Return whether a result with the settings of this job is stored."""
+        return self.result_file.is_file() and not differing_settings(self.result()["settings"], self.settings)
+
+    def result(self) -> dict[str, Any]:
+        """Return the content of result.json: `settings`, and the values that `measure` returned."""
+        return parse_json(read_text(self.result_file))
+
+    def progress(self) -> tuple[int, float] | None:
+        """Return the finished training steps, and environment or history steps per second; None without a log line."""
+        timing = last_line(self.run_folder / TIMING)
+        return None if timing is None else (timing["step"], timing["steps_per_second"] * self.options.steps_per_update)
+
+    def step_progress(self, on_update: OnUpdate) -> StepProgress:
+        """Return the trainer's function for progress that calls `on_update`."""
+        return lambda step, loss: on_update(step, (self.progress() or (0, 0.0))[1])
+
+    def finished_text(self) -> str:
+        """Return a note on the result for progress displays."""
+        return "finished"
+
+    def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
+        """Train the model, measure it, and write result.json."""
+        with run_lock(self.folder, wait=wait):
+            if self.is_finished():
+                return
+            content = {"settings": self.settings, **self.measure(on_update)}
+            with atomic_write(self.result_file) as partial:
+                write_json(partial, content)

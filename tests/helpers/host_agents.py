@@ -1,0 +1,33 @@
+"""A host agent that records what it receives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from icrl4aht_baselines.agents.host import EgoInput
+
+from icrl4aht_data.overcooked.actions import STAY
+
+
+class HostRecorder:
+    """A host agent that stays, or plays chosen actions, and records its inputs and actions after each reset.
+
+    Args:
+        choose: function from the number of tasks to the actions.
+    """
+
+    def __init__(self, choose: Callable[[int], Any] = lambda batch: np.full(batch, STAY)) -> None:
+        self.choose = choose
+        self.seen: list[list[EgoInput]] = []
+        self.played: list[list[Any]] = []
+
+    def reset(self, batch: int) -> None:
+        self.seen.append([])
+        self.played.append([])
+
+    def act(self, ego_input: EgoInput) -> Any:
+        self.seen[-1].append(ego_input)
+        self.played[-1].append(self.choose(len(ego_input.obs)))
+        return self.played[-1][-1]
