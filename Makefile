@@ -14,7 +14,7 @@ STAMP := $(VENV)/installed
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 CODE := icrl4aht_data generation baselines benchmarks tests docs/hooks.py
 
-.PHONY: help install constraints demo generate teammates verify control test test-slow check docs format bench-env bench-collect bench-gpu bench-learn bench-loader clean
+.PHONY: help install constraints demo generate teammates verify control test test-fast test-slow check docs format bench-env bench-collect bench-gpu bench-learn bench-loader clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -46,7 +46,10 @@ verify: install ## verify every byte and the physics of a release: ROOT=folder (
 control: install ## show that AD and DPT adapt in context in worlds built for it (about 10 minutes)
 	$(BIN)/icrl4aht-data control
 
-test: check ## lint, types and the default tests (5.5 minutes on 2 cores): WORKERS=2 (2 GB each)
+test: install ## lint, types and the default tests (5 minutes on 2 cores): WORKERS=2 (2 GB each)
+	@$(MAKE) --no-print-directory --jobs=2 check test-fast
+
+test-fast: install
 	$(PYTEST) -m "not slow"
 
 test-slow: install ## the slow tests: wheels, killed processes, Ray, several devices, long series of faults

@@ -23,7 +23,7 @@ from tests.helpers.commands import run_cli
 from tests.helpers.paths import ROOT
 from tests.helpers.published_files import KEPT, publish
 from tests.helpers.random_releases import random_release
-from tests.helpers.tiny import PAIR, TINY
+from tests.helpers.tiny import TINY
 from tests.helpers.two_sources import two_source_release
 from tests.helpers.xla_flags import add_xla_flag, is_xla_flag
 
@@ -152,26 +152,17 @@ def damaged(lite, tmp_path) -> Path:
     return root
 
 
-def _generate(profile: Path, out: Path, *options: str) -> None:
-    run_cli("generate", "--profile", profile, "--out", out, *options)
-
-
 @pytest.fixture(scope="session")
 def built(shared_folder) -> Path:
-    """A folder with tiny.toml, pair.toml, and `a`: the lite and full releases generated from tiny.toml. Read only."""
+    """A folder with tiny.toml, and `a`: the lite and full releases generated from tiny.toml. Read only."""
 
     def make(folder: Path) -> None:
         (folder / "tiny.toml").write_text(TINY)
-        (folder / "pair.toml").write_text(PAIR)
-        _generate(folder / "tiny.toml", folder / "a", "--kind", "lite", "--kind", "full")
+        run_cli(
+            "generate", "--profile", folder / "tiny.toml", "--out", folder / "a", "--kind", "lite", "--kind", "full"
+        )
 
     return shared_folder("built", make)
-
-
-@pytest.fixture(scope="session")
-def pair(built, shared_folder) -> Path:
-    """The release that the command `generate` makes from pair.toml. Read only."""
-    return shared_folder("pair", lambda folder: _generate(built / "pair.toml", folder))
 
 
 @pytest.fixture(scope="session")

@@ -31,25 +31,10 @@ def stream_returns(rewards: np.ndarray) -> np.ndarray:
     return rewards.reshape(len(rewards), -1, KEPT_STEPS).sum(axis=-1, dtype=np.float64)
 
 
-def best_streams(returns: np.ndarray, keep: int, least_improvement: float | None = None) -> np.ndarray:
-    """Return the streams with the highest final return plus improvement, best first: indices int (n,), n <= keep.
-
-    Args:
-        returns: (N, E), episode returns of a learner's streams.
-        keep: maximum number of streams.
-        least_improvement: minimum improvement from a stream's initial to its final return; None for no minimum.
-    """
-    start, end = curve_ends(returns)
-    order = np.argsort(-stream_score(returns), kind="stable")
-    if least_improvement is not None:
-        order = order[(end - start)[order] >= least_improvement]
-    return order[:keep]
-
-
 def select_streams(
     returns: Sequence[np.ndarray], keep: int, least_improvement: float | None = None
 ) -> list[np.ndarray]:
-    """Select up to `keep` streams from all learners of a task together; see `best_streams`.
+    """Select up to `keep` streams with the highest final return plus improvement from all learners of a task together.
 
     Learners take turns: in each round every learner adds its next best stream, and the learner with the best stream of
     the round comes first.
@@ -62,12 +47,14 @@ def select_streams(
     Returns:
         Indices of each learner's selected streams, int (n,), best first; the sum of all n is at most `keep`.
     """
-    candidates = [best_streams(of_learner, keep, least_improvement) for of_learner in returns]
-    turns = [
-        (turn, -float(stream_score(returns[learner][[stream]])[0]), learner)
-        for learner, streams in enumerate(candidates)
-        for turn, stream in enumerate(streams)
-    ]
+    candidates, turns = [], []
+    for learner, own in enumerate(returns):
+        (start, end), score = curve_ends(own), stream_score(own)
+        order = np.argsort(-score, kind="stable")
+        if least_improvement is not None:
+            order = order[(end - start)[order] >= least_improvement]
+        candidates.append(order)
+        turns += [(turn, -score[stream], learner) for turn, stream in enumerate(order)]
     chosen = [learner for _, _, learner in sorted(turns)[:keep]]
     return [streams[: chosen.count(learner)] for learner, streams in enumerate(candidates)]
 

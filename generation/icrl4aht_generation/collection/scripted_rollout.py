@@ -100,13 +100,10 @@ def scripted_batches(source: str, config: NoiseConfig) -> list[ScriptedBatch]:
     if source == "search":  # a batch has one episode per history, as the script remembers earlier episodes
         histories = np.arange(config.histories)
         return [(histories, np.full_like(histories, episode)) for episode in range(config.episodes)]
-    episodes = config.histories * config.episodes
-    found = []
-    for first in range(0, episodes, EPISODES_AT_ONCE):
-        # The last batch is filled up with copies of the last episode: equal sizes share one compilation.
-        numbers = np.minimum(first + np.arange(EPISODES_AT_ONCE), episodes - 1)
-        found.append(np.divmod(numbers, config.episodes))
-    return found
+    count, each = config.histories * config.episodes, np.arange(EPISODES_AT_ONCE)
+    # The last batch is filled up with copies of the last episode: equal sizes share one compilation.
+    numbers = [np.minimum(first + each, count - 1) for first in range(0, count, EPISODES_AT_ONCE)]
+    return [np.divmod(batch, config.episodes) for batch in numbers]
 
 
 def play_scripted_histories(

@@ -7,7 +7,7 @@ save. Every update is a pure function of the state, so the artefact is identical
 from __future__ import annotations
 
 import shutil
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -66,21 +66,21 @@ def learn_histories(
                 unwritten = rollout, metrics
                 if interval.due(number + 1):
                     on_update(number + 1, writer.write(number, *unwritten))
-                    writer.save(saved, state, number + 1)
+                    writer.sync()
+                    with writer.recording():
+                        saved.save(state, number + 1)
                     unwritten = None
         finish_artefact(partial, work, profile)
 
 
 def saved_progress(saved: StateFile) -> int:
     """Return the number of updates saved under the same settings; without a save, empty the folder and return 0."""
-    try:
-        done = saved.progress
-    except OtherSettingsError:  # another profile or version saved this state, so it cannot be resumed
-        done = None
-    if done is None:
-        shutil.rmtree(saved.path.parent, ignore_errors=True)
-        saved.path.parent.mkdir(parents=True)
-    return done or 0
+    with suppress(OtherSettingsError):  # another profile or version saved this state, so it cannot be resumed
+        if done := saved.progress:
+            return done
+    shutil.rmtree(saved.path.parent, ignore_errors=True)
+    saved.path.parent.mkdir(parents=True)
+    return 0
 
 
 def learner_key(work: Work) -> Any:

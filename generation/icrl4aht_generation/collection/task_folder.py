@@ -48,7 +48,7 @@ from icrl4aht_data.utils.files import (
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic
-from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, StateFile, last_line, xla_threads
+from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, last_line, xla_threads
 from icrl4aht_generation.learners.rollout import Rollout
 from icrl4aht_generation.profiles import Profile, Work
 
@@ -243,8 +243,7 @@ class ArrayWriter:
     Args:
         partial: an existing folder.
         shapes: shape and dtype of each array by name.
-        is_new: whether to create the files.
-        kept: number of updates for which lines of an existing log are kept; later lines are removed.
+        kept: number of updates to keep: 0 creates the files, a larger number removes later lines of the log.
 
     Attributes:
         arrays: memory map of each array by name.
@@ -254,12 +253,10 @@ class ArrayWriter:
         OSError: if the disk is full.
     """
 
-    def __init__(
-        self, partial: Path, shapes: Mapping[str, tuple[tuple[int, ...], str]], is_new: bool = True, kept: int = 0
-    ) -> None:
+    def __init__(self, partial: Path, shapes: Mapping[str, tuple[tuple[int, ...], str]], kept: int = 0) -> None:
         self._partial, self._names = partial, tuple(shapes)
         self._started, self._steps, self._recording, self._has_written = time.perf_counter(), 0, 0.0, False
-        if is_new:
+        if not kept:
             for name, (shape, dtype) in shapes.items():
                 new_mapped_array(partial / f"{name}.npy", shape, np.dtype(dtype))
         self.log = RunLog(partial, keep=lambda line: line["update"] < kept)
@@ -320,7 +317,7 @@ class ArtefactWriter(ArrayWriter):
     """
 
     def __init__(self, partial: Path, task: Task, config: PPOConfig, first: int) -> None:
-        super().__init__(partial, array_shapes(task.layout, config.environments, config.episodes), not first, first)
+        super().__init__(partial, array_shapes(task.layout, config.environments, config.episodes), first)
         self._task, self._config = task, config
 
     def write(self, number: int, rollout: Any, metrics: dict[str, Any]) -> float:
@@ -336,16 +333,10 @@ class ArtefactWriter(ArrayWriter):
         self.log.write(line, timing={"update": number} | timing)
         return timing["steps_per_second"]
 
-    def save(self, saved: StateFile, state: Any, updates: int) -> None:
-        """Flush the histories to the disk, then save the learner's state."""
-        self.sync()
-        with self.recording():
-            saved.save(state, updates)
-
     def write_checkpoint(self, updates: int, network: ActorCritic, params: Any) -> None:
         """Write and sync a checkpoint of the ego if this number of updates is among `checkpoint_updates`.
 
-        Call this before `save`, so that a resumed task has all checkpoints.
+        Call this before saving the learner's state, so that a resumed task has all checkpoints.
         """
         moments = checkpoint_updates(self._config)
         if updates in moments:

@@ -10,6 +10,7 @@ from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from threading import current_thread, main_thread
 from typing import Any
@@ -75,16 +76,15 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
                 console.print(f"{labels[name]}: {outcome.job.finished_text()}")
                 missing.remove(name)
                 lines[name] = None
-                update_failures(path, lines)
-                continue
-            times = "once" if outcome.attempts == 1 else f"{outcome.attempts} times"
-            console.print(f"{labels[name]}: failed {times}: {outcome.error}")
-            details = {"attempts": outcome.attempts, "error": outcome.error, "traceback": outcome.trace}
-            lines[name] = {"task_id": name, **details}
+            else:
+                last_error, attempts = outcome.error, outcome.attempts
+                times = "once" if attempts == 1 else f"{attempts} times"
+                console.print(f"{labels[name]}: failed {times}: {last_error}")
+                details = {"attempts": attempts, "error": last_error, "traceback": outcome.trace}
+                lines[name] = {"task_id": name, **details}
             update_failures(path, lines)
-            last_error = outcome.error
-            if options.fail_fast:
-                raise FailedJobsError(f"{path}: stopped after the first failure: {outcome.error}")
+            if lines[name] and options.fail_fast:
+                raise FailedJobsError(f"{path}: stopped after the first failure: {last_error}")
     is_written = update_failures(path, lines)
     if missing:
         reasons = f"{path} lists the reasons"
@@ -118,13 +118,10 @@ def _run_all(jobs: Sequence[Job], board: JobBoard, options: QueueOptions) -> Gen
 def _run_serially(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
     """Run the jobs one after another in this process."""
     for job in jobs:
-
-        def on_update(updates: int, speed: float, name: str = job.name) -> None:
-            board.show_running(name, updates, speed)
-
         for attempt in range(1, options.retries + 2):
             try:
-                outcome = JobOutcome(job, run_job(job, wait, on_update), attempt)
+                status = run_job(job, wait, partial(board.show_running, job.name))
+                outcome = JobOutcome(job, status, attempt)
                 break
             except Exception as error:  # whatever the error is, the other jobs continue
                 outcome = _failed_outcome(job, attempt, error)

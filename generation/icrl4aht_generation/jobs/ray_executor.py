@@ -76,10 +76,17 @@ def _check_reachable(address: str | None) -> None:
 
 @contextmanager
 def _connected(options: QueueOptions) -> Iterator[Any]:
+    settings: dict[str, Any] = {"address": options.address or "local", "log_to_driver": False, "logging_level": "ERROR"}
     if options.address is None:
         # Ray reads this variable when it is imported. Despite its name, it makes Ray listen only on 127.0.0.1.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+        # Ray uses all cores by default, and finds GPUs itself.
+        settings |= {
+            "num_cpus": options.workers,
+            "include_dashboard": False,
+            "object_store_memory": _OBJECT_STORE_BYTES,
+        }
     elif options.workers is not None:
         raise OptionError(f"workers = {options.workers}: the Ray cluster at {options.address} sets the number; omit it")
     try:
@@ -87,13 +94,6 @@ def _connected(options: QueueOptions) -> Iterator[Any]:
     except ImportError as error:
         raise OptionError(f"the executor ray needs Ray: {install_command('cluster')}") from error
     _check_reachable(options.address)
-    settings: dict[str, Any] = {"address": options.address or "local", "log_to_driver": False, "logging_level": "ERROR"}
-    if options.address is None:  # Ray uses all cores by default, and finds GPUs itself
-        settings |= {
-            "num_cpus": options.workers,
-            "include_dashboard": False,
-            "object_store_memory": _OBJECT_STORE_BYTES,
-        }
     try:
         ray.init(**settings)
     except (ConnectionError, ValueError, RuntimeError) as error:

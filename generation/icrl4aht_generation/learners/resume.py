@@ -219,7 +219,7 @@ class StateFile:
                 saved = {name: file.get_tensor(name) for name in names}
         except SafetensorError as error:
             raise self._unreadable(str(error)) from error
-        expected = {name: _shape_text(_data_shape(leaf)) for name, leaf in wanted.items()}
+        expected = {name: _shape_text(leaf) for name, leaf in wanted.items()}
         found = {name: _shape_text(array) for name, array in saved.items()}
         # Report only the first difference, because a state of another network differs in most arrays.
         for name in sorted(expected.keys() | found.keys()):
@@ -357,12 +357,9 @@ def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _data_shape(leaf: Any) -> Any:
-    return jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
-
-
-def _shape_text(array: Any) -> str:
-    return f"{np.dtype(array.dtype)} {tuple(array.shape)}"
+def _shape_text(leaf: Any) -> str:
+    data = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+    return f"{np.dtype(data.dtype)} {tuple(data.shape)}"
 
 
 def _host_array(leaf: Any) -> np.ndarray:

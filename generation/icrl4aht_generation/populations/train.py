@@ -277,13 +277,12 @@ class _PopulationTraining:
     def _train_stage(self, stage: int, resumed: PopulationState | None, log: RunLog) -> None:
         population, updates = self.run.stages[stage], self.run.config.updates
         state: PopulationState = resumed or jax.jit(population.init)(self._key(stage))
-        update = jax.jit(population.update, donate_argnums=0)
         moments = checkpoint_updates(self.run.config)
         started, first = time.perf_counter(), int(state.update)
         for number in range(first, updates):
             if self.run.algorithm == "comedi" and stage and number % max(1, updates // _SELECTIONS) == 0:
                 state = state._replace(params=self._with_nearest_member(state.params, stage, number))
-            state, metrics = update(state)
+            state, metrics = population.compiled_update(state)
             seconds = time.perf_counter() - started
             line = self._metrics_line(stage, number, metrics)
             speed = round((number + 1 - first) * population.steps_per_update / seconds, 1)

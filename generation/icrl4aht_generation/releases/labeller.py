@@ -121,10 +121,9 @@ def choose_checkpoint(returns: np.ndarray) -> int:
     means = differences.mean(axis=1)
     errors = differences.std(axis=1, ddof=1) / np.sqrt(returns.shape[1])
     clearly = (means >= _LEAST_GAIN) & (means > _STANDARD_ERRORS * errors)
-    if not clearly.any():
-        return len(returns) - 1
     best = np.where(clearly, means, -np.inf)
-    return len(best) - 1 - int(np.argmax(best[::-1]))  # the latest of equally good checkpoints
+    # The latest of equally good checkpoints, and so the last checkpoint if no other is clearly better.
+    return len(best) - 1 - int(np.argmax(best[::-1]))
 
 
 def _measure(checkpoints: list[Path], task: Task, suite: Path) -> CheckpointReturns:

@@ -106,11 +106,6 @@ class TeammateFacts(NamedTuple):
     references: ReferenceEgos
     nearest: NearestTest | None
 
-    @property
-    def matters(self) -> bool:
-        """Whether an ego can raise the return with this teammate."""
-        return self.references.egos_differ
-
 
 def teammate_facts(
     tasks: Iterable[Task], artefacts: Path, suite: Path, headroom: Mapping[str, ReferenceEgos] | None = None
@@ -195,7 +190,7 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
     heuristics = [task for task in tasks if task.teammate_family != "rl"]
     missing = [task for task in learned if task.task_id not in headroom]
     returns = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
-    returns |= learned_headroom(missing, suite) if missing else {}
+    returns |= learned_headroom(missing, suite)
     for task in heuristics:  # one at a time, because tasks may have different recipes
         (egos,) = reference_returns(task.layout, [build_teammate(None, task.teammate)])
         returns[task.task_id] = reference_egos(egos)
@@ -210,10 +205,10 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
 
 def unusable_families(layouts: Iterable[str]) -> list[LeftOutTask]:
     """Return heuristic families without usable sampled training teammates, with the reasons, for each layout."""
-    found = []
-    for layout in (layout for layout in layouts if layout in TESTED_ON):
-        hosted = usable_families(layout)
-        for family in (family for family in HEURISTIC_FAMILIES if family not in hosted):
-            reason = unusable_reason(layout, family)
-            found.append(LeftOutTask("", layout, HEURISTIC_KINDS[family], "", 0, 0, None, None, reason))
-    return found
+    return [
+        LeftOutTask("", layout, HEURISTIC_KINDS[family], "", 0, 0, None, None, unusable_reason(layout, family))
+        for layout in layouts
+        if layout in TESTED_ON
+        for family in HEURISTIC_FAMILIES
+        if family not in usable_families(layout)
+    ]

@@ -106,7 +106,7 @@ def select_histories(
     else:
         streams = [np.arange(len(own)) for own in returns]
     found = TaskHistories(task, source, folders, returns, streams, least)
-    if least is not None and not facts.matters:
+    if least is not None and not facts.references.egos_differ:
         return found.left_out(
             f"the ego does not matter: returns of these egos differ by less than {LEAST_HEADROOM:g}: "
             f"{facts.references.describe()}"
@@ -155,7 +155,7 @@ def package_release(
     """
     check_release_folder(target, profile)
     tasks = grouped(units, lambda work: work.task.task_id)
-    headroom = {members[0].task.layout.name for task_id, members in tasks.items() if facts[task_id].matters}
+    headroom = {work.task.layout.name for work in units if facts[work.task.task_id].references.egos_differ}
     recorded, new, omitted, curves = recorded_provenance(suite), [], list(left_out), SourceCurves()
     for task_id, members in tasks.items():
         task = members[0].task

@@ -69,7 +69,7 @@ def test_collection_killed_at_random_times_writes_the_same_artefact(built, tmp_p
     seed = int(os.environ.get("KILL_SEED", "7"))
     print(f"KILL_SEED={seed}")
     random, firsts, killed = np.random.default_rng(seed), [], []
-    for _ in range(3):
+    for _ in range(2):
         updates, then = int(random.integers(2, 5)), float(random.uniform(0, 0.1))
         killed.append(f"after {updates} updates and {then:.3f} s")
         process = start(*command)

@@ -1,18 +1,18 @@
-"""Collection of all tasks of a rebuild: missing tasks, two processes at once, and workers on Ray."""
+"""Collection of all tasks of a rebuild: unfinished tasks, two processes at once, and workers on Ray."""
 
 from __future__ import annotations
 
 import ipaddress
 import json
 import shutil
-import sys
 import time
+from pathlib import Path
 
 import psutil
 import pytest
 from icrl4aht_generation.collection.job import CollectionJob
-from icrl4aht_generation.collection.task_folder import LEARNER, partial_folder
-from icrl4aht_generation.jobs.job import JobBoard, run_job
+from icrl4aht_generation.collection.task_folder import LEARNER, METADATA, partial_folder
+from icrl4aht_generation.jobs.job import FailedJobsError, JobBoard, run_job
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
 from icrl4aht_generation.learners.resume import run_lock
@@ -20,58 +20,61 @@ from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases.check import compare_rebuilds
 from rich.console import Console
 
-from icrl4aht_data import verify_release
-from icrl4aht_data.commands.cli import main
+from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import OptionError
+from tests.helpers.commands import run_cli
 from tests.helpers.jobs import FileJob
-from tests.helpers.tiny import artefact, start
+from tests.helpers.tiny import PAIR, artefact, start
+
+
+@pytest.fixture(scope="module")
+def profile(tmp_path_factory) -> Path:
+    """Return a profile with the task of `built` and a second task; its name is part of every artefact."""
+    path = tmp_path_factory.mktemp("pair") / "tiny.toml"
+    path.write_text(PAIR)
+    return path
 
 
 @pytest.fixture
-def tasks(built):
-    profile = load_profile(str(built / "pair.toml"))
-    return profile.units(), profile
-
-
-def test_task_collected_by_another_process_is_waited_for(tasks, built, tmp_path):
-    """A task that another process finishes in the meantime is not collected again."""
-    work, profile = tasks[0][0], tasks[1]
-    folder = tmp_path / "artefacts" / work.name
-    folder.parent.mkdir()
-    with run_lock(folder):
-        assert run_job(CollectionJob(work, profile, folder.parent), wait=False) == "busy"
-        shutil.copytree(artefact(built / "a"), folder)
-    before = (folder / "metadata.json").stat().st_mtime_ns
-    assert run_job(CollectionJob(work, profile, folder.parent), wait=True) == "done"
-    assert (folder / "metadata.json").stat().st_mtime_ns == before
-
-
-def test_unfinished_task_gives_exit_code_1_and_no_release(tasks, built, tmp_path, monkeypatch, capsys):
-    shutil.copytree(built / "a" / "artefacts", tmp_path / "artefacts")
-    partial = partial_folder(tmp_path / "artefacts" / tasks[0][1].name)
-    partial.mkdir()
+def unfinished(profile, built, tmp_path) -> Path:
+    """Return the folder of a damaged partial artefact of the second task."""
+    (name,) = {work.name for work in load_profile(str(profile)).units()} - {artefact(built / "a").name}
+    partial = partial_folder(tmp_path / "artefacts" / name)
+    partial.mkdir(parents=True)
     (partial / LEARNER).write_bytes(b"junk")
-    monkeypatch.setattr(
-        sys, "argv", ["icrl4aht_generation", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
-    )
-    with pytest.raises(SystemExit, match="1"):
-        main()
-    captured = capsys.readouterr()
-    assert "1 of 2 jobs are unfinished" in captured.err
-    assert "finished before" in captured.out
+    return partial
+
+
+def test_task_collected_by_another_process_is_waited_for(built, tmp_path):
+    """A task that another process finishes in the meantime is not collected again."""
+    profile = load_profile(str(built / "tiny.toml"))
+    (work,) = profile.units()
+    job = CollectionJob(work, profile, tmp_path)
+    with run_lock(job.folder):
+        assert run_job(job, wait=False) == "busy"
+        shutil.copytree(artefact(built / "a"), job.folder)
+    before = (job.folder / METADATA).stat().st_mtime_ns
+    assert run_job(job, wait=True) == "done"
+    assert (job.folder / METADATA).stat().st_mtime_ns == before
+
+
+def test_rebuild_with_an_unfinished_task_writes_no_release(profile, unfinished, built, tmp_path):
+    shutil.copytree(artefact(built / "a"), unfinished.parent / artefact(built / "a").name)
+    with pytest.raises(FailedJobsError, match="1 of 2 jobs are unfinished"):
+        run_cli("generate", "--profile", profile, "--out", tmp_path)
     assert not (tmp_path / "lite").exists()
 
 
 @pytest.mark.slow
-def test_two_generate_commands_at_once_collect_each_task_once(built, pair, tmp_path):
-    command = ["-m", "icrl4aht_data", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
+def test_two_generate_commands_at_once_collect_a_task_once(built, tmp_path):
+    command = ["-m", "icrl4aht_data", "generate", "--profile", str(built / "tiny.toml"), "--out", str(tmp_path)]
     processes = [start(*command) for _ in range(2)]
     outputs = [process.communicate() for process in processes]
     assert [process.returncode for process in processes] == [0, 0], outputs
-    for folder in (artefact(tmp_path, 0), artefact(tmp_path, 1)):
-        updates = [json.loads(line)["update"] for line in (folder / "timing.jsonl").read_text().splitlines()]
-        assert updates == list(range(25))
-    assert not compare_rebuilds(tmp_path, pair).differences
+    timing = (artefact(tmp_path) / "timing.jsonl").read_text().splitlines()
+    assert [json.loads(line)["update"] for line in timing] == list(range(25))
+    for part in ("artefacts", "lite"):
+        assert not compare_rebuilds(tmp_path / part, built / "a" / part).differences
 
 
 def listening_addresses(process: psutil.Process) -> set[str]:
@@ -86,16 +89,12 @@ def listening_addresses(process: psutil.Process) -> set[str]:
 
 
 @pytest.mark.slow
-def test_two_ray_workers_collect_bit_equal_tasks(built, pair, tmp_path):
-    """A damaged task fails and the other task finishes; after a repair both tasks equal those collected in one process.
-    Meanwhile, no process listens on addresses other than the loopback."""
-    broken = partial_folder(tmp_path / "artefacts" / artefact(pair, 1).name)
-    broken.mkdir(parents=True)
-    (broken / LEARNER).write_bytes(b"junk")
-    command = ["-m", "icrl4aht_data", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
-    command += ["--executor", "ray", "--workers", "2", "--retries", "1"]
+def test_ray_workers_collect_bit_equal_tasks(profile, unfinished, built, tmp_path):
+    """A damaged task fails on Ray, and the other task equals the task collected in one process. After a repair, the
+    damaged task is also collected. Meanwhile, no process listens on addresses other than the loopback."""
+    command = ["-m", "icrl4aht_data", "generate", "--profile", str(profile), "--out", str(tmp_path)]
     addresses: set[str] = set()
-    process = start(*command)
+    process = start(*command, "--executor", "ray", "--workers", "2", "--retries", "1")
     while process.poll() is None:
         addresses |= listening_addresses(psutil.Process(process.pid))
         time.sleep(0.5)  # listing all connections takes much CPU time
@@ -107,14 +106,14 @@ def test_two_ray_workers_collect_bit_equal_tasks(built, pair, tmp_path):
     assert line["error"].startswith("OptionError: ")
     assert "in progress" in line["traceback"]
     assert "\x1b" not in line["traceback"]
-    assert artefact(tmp_path).name == artefact(pair).name
-    shutil.rmtree(broken)
-    output, errors = (process := start(*command)).communicate()
-    assert process.returncode == 0, output + errors
-    assert not compare_rebuilds(tmp_path, pair).differences
-    assert verify_release(tmp_path / "lite").ok
+    own = artefact(built / "a")
+    assert not compare_rebuilds(unfinished.parent / own.name, own).differences
     assert addresses
     assert all(ipaddress.ip_address(address.removeprefix("::ffff:")).is_loopback for address in addresses), addresses
+    shutil.rmtree(unfinished)
+    run_cli("generate", "--profile", profile, "--out", tmp_path)
+    assert len(load_icrl4aht(tmp_path / "lite").tasks) == 2
+    assert verify_release(tmp_path / "lite").ok
 
 
 def test_number_of_workers_for_an_existing_ray_cluster_raises_error(tmp_path):

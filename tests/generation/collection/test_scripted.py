@@ -17,7 +17,7 @@ from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.collection.scripted import scripted_bytes
 from icrl4aht_generation.collection.scripted_rollout import noise_schedules, play_scripted_histories
 from icrl4aht_generation.collection.task_folder import METADATA, TIMING, last_timing, partial_folder
-from icrl4aht_generation.jobs.job import OnUpdate
+from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS
 from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.releases.check import compare_rebuilds
@@ -30,8 +30,10 @@ from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.errors import DiskFullError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.rules import step
-from tests.generation.teammates.test_learned import entry, save
-from tests.helpers.tiny import NOISE, start
+from icrl4aht_data.utils.files import file_hash
+from tests.generation.teammates.test_learned import save
+from tests.helpers.commands import run_cli
+from tests.helpers.tiny import NOISE
 
 PIECE = 16
 LAYOUT = get_layout("demo_wide")
@@ -68,14 +70,6 @@ def noise_artefact(profile, small_batches, tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def arrays(noise_artefact) -> dict[str, np.ndarray]:
     return {path.stem: np.load(path) for path in noise_artefact.glob("*.npy")}
-
-
-def stop_after(pieces: int) -> OnUpdate:
-    def report(done, speed):
-        if done >= pieces:
-            raise KeyboardInterrupt
-
-    return report
 
 
 def test_noise_artefact_has_arrays_of_expected_shapes_and_size(arrays, noise_artefact, profile):
@@ -136,14 +130,6 @@ def test_episode_depends_only_on_seed_history_and_episode_number(arrays):
     assert not np.array_equal(np.asarray(other.state)[0], np.asarray(found.state)[0])
 
 
-@pytest.mark.slow
-def test_histories_do_not_depend_on_the_batch_size(noise_artefact, profile, tmp_path, monkeypatch):
-    monkeypatch.setattr(scripted_rollout, "EPISODES_AT_ONCE", 23)
-    job = CollectionJob(WORK, profile, tmp_path)
-    job.run()
-    assert not compare_rebuilds(job.folder, noise_artefact).differences
-
-
 def test_noise_schedules_follow_their_settings():
     """Schedules follow the formula and the ranges; a history's schedule does not depend on the number of histories."""
     linear = noise_schedules(NoiseConfig(histories=2, episodes=11), 0)
@@ -167,8 +153,13 @@ def test_noise_schedules_follow_their_settings():
 
 def test_stopped_scripted_task_starts_again_with_equal_result(noise_artefact, profile, tmp_path):
     job, seen = CollectionJob(WORK, profile, tmp_path), []
+
+    def stop(done, speed):
+        if done == 2:
+            raise KeyboardInterrupt
+
     with pytest.raises(KeyboardInterrupt):
-        job.run(stop_after(2))
+        job.run(stop)
     assert (partial_folder(job.folder) / "rewards.npy").exists()
     job.run(lambda done, speed: seen.append(done))
     assert seen == [1, 2, 3]
@@ -236,7 +227,8 @@ def test_noise_of_a_search_history_is_constant_until_its_last_episode():
 def test_scripted_histories_can_have_a_learned_teammate(profile, tmp_path):
     """The learned teammate takes the greedy actions of its policy."""
     save(tmp_path / "suite/member", LAYOUT)
-    mate = entry(tmp_path / "suite", "member")
+    theta = {"checkpoint": "member", "sha256": file_hash(tmp_path / "suite/member" / POLICY_WEIGHTS)}
+    mate = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0, "theta": theta}
     work = Work(make_task("teammate", "train", "demo_wide", mate, 3), "noise")
     job = CollectionJob(work, profile, tmp_path, tmp_path / "suite")
     job.run()
@@ -250,19 +242,11 @@ def test_scripted_histories_can_have_a_learned_teammate(profile, tmp_path):
 
 @pytest.mark.slow
 def test_generate_check_and_verify_commands_accept_scripted_histories(tmp_path):
-    """A release generated in one process is valid, and its tasks collected again on Ray give the same bits."""
+    """A release is valid, and its tasks collected again in a new process, in batches of 256 episodes, are equal."""
     (tmp_path / "noise.toml").write_text(NOISE)
-    command = ("-m", "icrl4aht_data", "generate", "--profile", str(tmp_path / "noise.toml"), "--out")
-    again = ("--tasks", str(tmp_path / "a/lite/meta/tasks.jsonl"), "--executor", "ray", "--workers", "1")
+    command = ("generate", "--profile", tmp_path / "noise.toml", "--out")
+    again = ("--tasks", tmp_path / "a/lite/meta/tasks.jsonl", "--workers", 2)
     for name, options in (("a", ()), ("b", again)):
-        process = start(*command, str(tmp_path / name), *options)
-        output, errors = process.communicate()
-        assert process.returncode == 0, output + errors
-        assert "demo_wide with utility_greedy, noise: finished at " in output
-    for command in (
-        ("-m", "icrl4aht_data", "check", str(tmp_path / "a"), str(tmp_path / "b")),
-        ("-m", "icrl4aht_data", "verify", str(tmp_path / "a" / "lite"), "--deep"),
-    ):
-        process = start(*command)
-        output, errors = process.communicate()
-        assert process.returncode == 0, output + errors
+        assert "demo_wide with utility_greedy, noise: finished at " in run_cli(*command, tmp_path / name, *options)
+    run_cli("check", tmp_path / "a", tmp_path / "b")
+    run_cli("verify", tmp_path / "a" / "lite", "--deep")

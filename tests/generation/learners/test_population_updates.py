@@ -52,11 +52,8 @@ class Updated(NamedTuple):
     rollout: Rollout
 
 
-def second_update(algorithm: Algorithm, learning: bool = True) -> Updated:
-    """Return the second update of a population, in which the learning rate's warm-up is over.
-
-    Without `learning`, policies do not change, so the update compiles in a third of the time.
-    """
+def second_update(algorithm: Algorithm) -> Updated:
+    """Return the second update of a population, in which the learning rate's warm-up is over."""
     trained = population(algorithm)
 
     @jax.jit
@@ -69,8 +66,6 @@ def second_update(algorithm: Algorithm, learning: bool = True) -> Updated:
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(population_module, "roll_out", recorded)
-            if not learning:
-                patch.setattr(Population, "_learn", lambda self, state, *rest: (state.params, state.optimizer, {}))
             return *trained.update(state), *rollouts[0]
 
     before = update(jax.jit(trained.init)(jax.random.key(5)))[0]
@@ -81,12 +76,6 @@ def second_update(algorithm: Algorithm, learning: bool = True) -> Updated:
 @pytest.fixture(scope="module")
 def comedi() -> Updated:
     return second_update(CoMeDi())
-
-
-@pytest.fixture(scope="module")
-def comedi_play() -> Updated:
-    """Return an update of CoMeDi in which no policy changes."""
-    return second_update(CoMeDi(), learning=False)
 
 
 @pytest.fixture(scope="module")
@@ -183,15 +172,15 @@ def test_lbrdiv_multipliers_follow_the_returns_of_the_environments(lbrdiv):
 
 
 @pytest.mark.slow
-def test_comedi_starts_some_episodes_in_states_of_mixed_play(comedi_play):
+def test_comedi_starts_some_episodes_in_states_of_mixed_play(comedi):
     """The last quarter of environments starts from states that the third quarter visited in the previous roll-out."""
-    source = comedi_play.population.assignment.starts_from
-    started = np.asarray(comedi_play.after.carry.env.record)
-    visited = np.asarray(comedi_play.before.visited)
+    source = comedi.population.assignment.starts_from
+    started = np.asarray(comedi.after.carry.env.record)
+    visited = np.asarray(comedi.before.visited)
     moved = source >= 0
     assert moved.sum() == 4
     np.testing.assert_array_equal(started[moved], visited[source[moved]])
-    env = comedi_play.after.carry.env
-    fresh = np.asarray(jax.jit(comedi_play.population.env.first_record)(env.key, env.episode))
+    env = comedi.after.carry.env
+    fresh = np.asarray(jax.jit(comedi.population.env.first_record)(env.key, env.episode))
     np.testing.assert_array_equal(started[~moved], fresh[~moved])
     assert (started[moved] != fresh[moved]).any(axis=1).all()

@@ -171,16 +171,6 @@ def test_slot_records_show_each_agent_its_observation(batch):
     assert differ == len(slots)
 
 
-def test_memories_of_players_restart_with_each_episode(played):
-    """The players return the number of steps in the episode as their value."""
-    clock = np.arange(2 * STEPS) % EPISODE
-    for choice in played.rollout.choices:
-        np.testing.assert_array_equal(choice.value, np.broadcast_to(clock[:, None], choice.value.shape))
-    for notes, slots in zip(played.carry.memories, SLOTS, strict=True):
-        np.testing.assert_array_equal(notes.begun, played.rollout.record[15][slots % ENVS])
-        np.testing.assert_array_equal(notes.steps, 1)
-
-
 def test_players_restart_only_in_environments_whose_episode_ended():
     """The third environment starts two steps later in its episode than the others."""
     clock = np.array([0, 0, 2, 0])

@@ -17,6 +17,7 @@ from icrl4aht_generation.teammates.distances import hamming_distances
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
+from tests.helpers.states import random_records
 
 LAYOUT = get_layout("cramped_up")
 STEPS = 6
@@ -57,16 +58,6 @@ def actions(cache_all_programs) -> np.ndarray:
     return actions_on_common_states(LAYOUT, POLICIES, seed=3, steps=STEPS)
 
 
-@pytest.fixture(scope="module")
-def records(cache_all_programs) -> jax.Array:
-    """Return state records (T, episodes, S) of play by random agents."""
-    env = build.Environment(LAYOUT, STEPS)
-    players = [build.policy_player(env, build.REFERENCE_EGOS["random"], (), agent, 3) for agent in (0, 1)]
-    carry = build.init_rollout(env, players, jax.random.split(jax.random.key(0), 3))
-    play = jax.jit(lambda carry: build.roll_out(env, players, carry, STEPS, jax.random.key(1))[1].record)
-    return play(carry)
-
-
 def test_hamming_distances_equal_a_loop_over_states():
     actions = np.random.default_rng(0).integers(0, 6, (4, 50)).astype(np.int8)
     found = hamming_distances(actions)
@@ -95,8 +86,9 @@ def test_only_identical_policies_have_distance_0(actions):
 
 
 @pytest.mark.slow
-def test_actions_on_common_states_use_teammate_observations_and_memory(records, monkeypatch):
+def test_actions_on_common_states_use_teammate_observations_and_memory(monkeypatch):
     """Compare with expected actions: memory starts with each episode, and observations are the teammate's."""
+    records = random_records(LAYOUT, 3 * STEPS, np.random.default_rng(0)).reshape(STEPS, 3, -1)
     monkeypatch.setattr(build, "_visited_records", lambda env, numbers, family, key: records)
     found = actions_on_common_states(LAYOUT, [policy(2), policy(1, act_by_state)], steps=STEPS)
     repeated = np.concatenate([records, records], axis=1)  # one copy for each of the two families

@@ -49,8 +49,6 @@ LAYOUT = get_layout("cramped_up")
 SMOKE = load_profile("smoke").teammates
 EACH_KIND = pytest.mark.parametrize("algorithm", ["lbrdiv", pytest.param("comedi", marks=pytest.mark.slow)])
 """LBRDiv trains pairs of policies, CoMeDi trains in stages; `test_generate.py` trains FCP and BRDiv."""
-FIRST_MEMBER = {"comedi": 1}
-"""First policy that can become a teammate, if not 0; CoMeDi's policy 0 is trained only by self-play."""
 CONFIG, WIDTHS = replace(SMOKE.ppo, epochs=1), SMOKE.ppo.widths
 
 
@@ -117,13 +115,13 @@ def weight_hashes(folder: Path) -> dict[str, str]:
 @EACH_KIND
 def test_population_has_five_checkpoints_of_each_member(trained, algorithm):
     found = list(suite_checkpoints(trained(algorithm), LAYOUT.name, algorithm))
-    first, start = FIRST_MEMBER.get(algorithm, 0), 5 * FIRST_MEMBER.get(algorithm, 0)
+    first = int(algorithm == "comedi")  # CoMeDi's policy 0 is trained only by self-play and is no teammate
     names = [f"{LAYOUT.name}/{algorithm}/m{m}/c{c}" for m in range(first, first + 2) for c in range(5)]
     assert [point.path for point in found] == names
     folder = population(trained(algorithm), algorithm)
     responses = ["m0", "m1"] if algorithm in ("brdiv", "lbrdiv") else []
     assert sorted(path.name for path in folder.glob("responses/*")) == responses
-    assert len(set(weight_hashes(folder).values())) == start + 10 + len(responses), "all policies differ"
+    assert len(set(weight_hashes(folder).values())) == 5 * first + 10 + len(responses), "all policies differ"
     assert job_of(algorithm, trained(algorithm)).is_finished()
     assert not list(folder.glob("resume*"))
 
@@ -131,7 +129,7 @@ def test_population_has_five_checkpoints_of_each_member(trained, algorithm):
 @EACH_KIND
 def test_cards_describe_checkpoints_of_a_population(trained, algorithm):
     for number, point in enumerate(suite_checkpoints(trained(algorithm), LAYOUT.name, algorithm)):
-        member, checkpoint = divmod(number + 5 * FIRST_MEMBER.get(algorithm, 0), 5)
+        member, checkpoint = divmod(number + 5 * (algorithm == "comedi"), 5)
         card = point.card
         assert (card["algorithm"], card["layout"], card["seed"]) == (algorithm, "cramped_up", 0)
         assert (card["member"], card["checkpoint"]) == (member, checkpoint)
@@ -271,21 +269,16 @@ def paths(points: list[SuiteCheckpoint]) -> list[str]:
     return [point.path for point in points]
 
 
-def test_first_policy_of_comedi_is_not_a_candidate(candidates):
-    """CoMeDi's first policy is trained only by self-play, like the members of FCP."""
-    found = paths(list(suite_checkpoints(candidates, LAYOUT.name, "comedi")))
-    assert found == [f"{LAYOUT.name}/comedi/m{m}/c{c}" for m in range(1, 10) for c in range(5)]
-    chosen = select_teammates(candidates, LAYOUT.name, "comedi", train=1000, heldout=0)
-    assert (chosen.candidates, chosen.good) == (45, 37)
-    assert not [path for path in paths(chosen.train) if "/m0/" in path]
-
-
 def test_only_checkpoints_with_returns_above_the_threshold_are_selected(candidates):
-    chosen = select_teammates(candidates, LAYOUT.name, "fcp", train=1000, heldout=0)
-    assert (chosen.candidates, chosen.good, len(chosen.train)) == (50, 40, 40)
-    everyone = chosen.train + chosen.heldout
-    assert len(set(paths(everyone))) == 40
-    assert all(point.card["teammate_return"] > 20 for point in everyone)
+    """CoMeDi's first policy is not a candidate, because it is trained only by self-play, like the members of FCP."""
+    for algorithm, first, counts in (("fcp", 0, (50, 40)), ("comedi", 1, (45, 37))):
+        found = paths(list(suite_checkpoints(candidates, LAYOUT.name, algorithm)))
+        assert found == [f"{LAYOUT.name}/{algorithm}/m{m}/c{c}" for m in range(first, 10) for c in range(5)]
+        chosen = select_teammates(candidates, LAYOUT.name, algorithm, train=1000, heldout=0)
+        assert (chosen.candidates, chosen.good) == counts
+        assert len({*paths(chosen.train)}) == len(chosen.train + chosen.heldout) == chosen.good
+        assert {*paths(chosen.train)} < {*found}
+        assert all(point.card["teammate_return"] > 20 for point in chosen.train)
 
 
 def test_selection_depends_on_seed_and_algorithm(candidates):

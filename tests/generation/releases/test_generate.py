@@ -20,12 +20,14 @@ from icrl4aht_generation.learners.checkpoint import load_policy
 from icrl4aht_generation.populations import select
 from icrl4aht_generation.populations import train as suite
 from icrl4aht_generation.profiles import load_profile
-from icrl4aht_generation.releases import build, measures, package
+from icrl4aht_generation.releases import build, labeller, measures, package
 from icrl4aht_generation.releases.check import compare_rebuilds
+from icrl4aht_generation.releases.labeller import CheckpointReturns
 from icrl4aht_generation.teammates.registry import recover_teammate
 from rich.console import Console
 
 from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.benchmark.facts import LABEL_EPISODES
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import NearestTest
@@ -127,14 +129,22 @@ def test_bundle_release_replaces_the_bundled_release(built, monkeypatch, tmp_pat
 
 
 @pytest.fixture(scope="module", autouse=True)
-def no_distances():
-    """Replace distances of learned teammates to the test teammates, which take most of a minute to compile."""
+def quick_measurements():
+    """Replace slow measurements with learned teammates: their distances, and the returns of checkpoints."""
+    measure_checkpoints = labeller._measure
 
-    def fake_nearest(layout, policies) -> list[NearestTest]:
+    def measure(checkpoints, task, suite) -> CheckpointReturns:
+        if task.teammate_family != "rl":
+            return measure_checkpoints(checkpoints, task, suite)
+        returns = [[float(number)] * LABEL_EPISODES for number, _ in enumerate(checkpoints)]
+        return CheckpointReturns(returns, returns)
+
+    def nearest(layout, policies) -> list[NearestTest]:
         return [NearestTest("H4/t0", 0.5, number) for number, _ in enumerate(policies)]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(measures, "nearest_test", fake_nearest)
+        patch.setattr(labeller, "_measure", measure)
+        patch.setattr(measures, "nearest_test", nearest)
         yield
 
 

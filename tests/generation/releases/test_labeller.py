@@ -130,11 +130,9 @@ def test_damaged_or_outdated_measurements_are_repeated(task, tmp_path, monkeypat
 
 
 @pytest.mark.slow
-def test_measured_returns_equal_those_of_a_loop_over_steps(task, tmp_path):
+def test_measured_returns_equal_those_of_a_loop_over_steps(task):
     """Compare greedy returns of the last checkpoint with a loop over steps of the environment."""
     chosen, _, folder = task
-    (folder / LABELLER_RETURNS).unlink()
-    choose_labeller([folder], chosen, tmp_path)
     network, params, _ = load_policy(folder / "checkpoints/c4")
     mate = build_teammate(chosen.layout, chosen.teammate, TEAMMATE, "seeded")
     env = Environment(chosen.layout, 400)
@@ -160,37 +158,24 @@ def test_measured_returns_equal_those_of_a_loop_over_steps(task, tmp_path):
     assert measured(folder)["greedy"][4] == returns.tolist()
 
 
-def test_index_provenance_and_card_describe_the_labeller(built):
-    root = built / "a" / "lite"
-    found = measured(artefact(built / "a"))
-    greedy, sampled = np.mean(found["greedy"], axis=1), np.mean(found["sampled"], axis=1)
-    number = choose_checkpoint(np.array(found["greedy"]))
-    step = 3_200 * (number + 1)
-    for entry in load_icrl4aht(root).entries:
-        assert (entry.expert_return, entry.expert_return_sampled) == (greedy[number], sampled[number])
-        assert entry.expert_step == step
-    (of_task,) = read_provenance(root / "meta/provenance.json").values()
-    expert = of_task.expert
-    assert expert is not None
-    assert (expert.return_greedy, expert.return_sampled) == (greedy[number], sampled[number])
-    assert (expert.last_return_greedy, expert.episodes) == (greedy[-1], 200)
-    assert expert.policy_sha256 == file_hash(artefact(built / "a") / f"checkpoints/c{number}/policy.safetensors")
-    assert "## Labels" in (root / "README.md").read_text()
-
-
 def test_clearly_better_earlier_checkpoint_labels_the_histories(task, tmp_path):
     chosen, _, folder = task
     with_returns(folder, [0, 60, 20, 5, 0])
+    sampled = np.mean(measured(folder)["sampled"][1])
     root = package_task(task, tmp_path / "lite")
     dataset = load_icrl4aht(root)
     network, params, card = load_policy(folder / "checkpoints/c1")
     for history in dataset:
         labels = relabel(chosen.layout, network, params, history.state[:])
         np.testing.assert_array_equal(history.expert_actions[:], labels)
-        assert (history.entry.expert_return, history.entry.expert_step) == (60, card["steps"])
+        assert (history.entry.expert_return, history.entry.expert_return_sampled) == (60, sampled)
+        assert history.entry.expert_step == card["steps"] == 3_200 * 2
     expert = read_provenance(root / "meta/provenance.json")[chosen.task_id].expert
     assert expert is not None
-    assert (expert.step, expert.last_return_greedy) == (card["steps"], 0)
+    assert (expert.return_greedy, expert.return_sampled) == (60, sampled)
+    assert (expert.step, expert.last_return_greedy, expert.episodes) == (card["steps"], 0, 200)
+    assert expert.policy_sha256 == file_hash(folder / "checkpoints/c1/policy.safetensors")
+    assert "## Labels" in (root / "README.md").read_text()
     assert verify_release(root).ok
 
 

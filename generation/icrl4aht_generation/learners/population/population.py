@@ -257,6 +257,11 @@ class Population:
         metrics = self._metrics(rollout) | {"shaping": shaping_weight(self.config, state.update)}
         return after, losses | metrics
 
+    @cached_property
+    def compiled_update(self) -> Callable[[PopulationState], tuple[PopulationState, dict[str, Array]]]:
+        """Compiled function `update`, which reuses the memory of its argument."""
+        return jax.jit(self.update, donate_argnums=0)
+
     def _players(self, params: Any) -> list[Player]:
         """Return one player for each group of policies."""
         return [
