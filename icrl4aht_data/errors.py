@@ -144,7 +144,7 @@ def check_choice(what: str, found: object, valid: Iterable[str]) -> None:
     Raises:
         UnknownNameError: if the value is not valid; the message lists the valid names and suggests the nearest.
     """
-    if found not in tuple(valid):
+    if not isinstance(found, str) or found not in tuple(valid):  # `in` would fail for an array
         raise unknown(what, found, valid)
 
 

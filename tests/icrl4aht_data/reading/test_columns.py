@@ -50,6 +50,12 @@ def test_unknown_column_raises_error_with_the_nearest_name(lite, name, nearest):
         load_icrl4aht(lite[0]).column(name)
 
 
+@pytest.mark.parametrize("name", [None, 3, ["layout"], np.array(["layout", "split"])])
+def test_column_name_that_is_no_text_raises_package_error(lite, name):
+    with pytest.raises(UnknownNameError, match=r"unknown column .*; valid: history_id, "):
+        load_icrl4aht(lite[0]).column(name)
+
+
 def test_to_pandas_returns_one_row_per_history(expert_release):
     dataset = load_icrl4aht(expert_release, layout=["demo_wide", "coord_simple"]).select([7, 0, 3])
     frame = dataset.to_pandas()
