@@ -60,7 +60,7 @@ _print = partial(print_line, "learn")
 
 
 def heuristic_learner(layout: Layout, config: PPOConfig) -> Learner:
-    """Return the learner of an ego with teammate H4 and the given hyper-parameters."""
+    """Return a PPO learner that trains an ego with teammate H4 and the given hyper-parameters."""
     mate = build_teammate(layout, heuristic_teammate("utility_greedy", "default", 0), noise="seeded")
     return Learner(Environment(layout), mate, config)
 

@@ -76,7 +76,10 @@ def published_reader(folder: Path, length: int) -> ReadWindows:
 
 
 def fair_reader(folder: Path, length: int, batch: int) -> ReadWindows:
-    """Return a reader that fills one reused buffer, from files with chunks as long as a window."""
+    """Return the fair peer of our loader, which uses h5py in a way that suits random windows.
+
+    Unlike the published reader, it reads files with chunks as long as a window, and fills one reused buffer.
+    """
     file = h5py.File(folder / HISTORIES_H5, "r")
     first: Any = {name: file[f"/0/{name}"] for name in _READ}
     out = {name: np.ones((batch, length, *data.shape[1:]), data.dtype) for name, data in first.items()}

@@ -241,7 +241,7 @@ class Dataset(Selection):
 
     @cached_property
     def tasks(self) -> dict[str, Task]:
-        """Tasks of the release by id; empty if a release of observations was made without tasks."""
+        """Tasks of the release by id; empty if a release of kind `observations` was made without tasks."""
         return {task.task_id: task for task in read_tasks(self.origin.file(TASKS))}
 
     def recover_environment(self, history_id: int, episode: int = 0, **options: Any) -> gymnasium.Env:

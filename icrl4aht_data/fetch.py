@@ -145,7 +145,9 @@ class Remote(ReleaseLocation):
         absent = [name for name in wanted if again or not self.is_downloaded(name)]
         if absent and offline_switches():
             listed = ", ".join(absent)
-            raise OfflineError(f"{self.url}: offline, but these files are missing or have changed: {listed}; go online")
+            raise OfflineError(
+                f"{self.url}: offline, but these files are missing or have changed: {listed}; {_unset_text()}"
+            )
         if not absent:
             return
         with ExitStack() as stack:
@@ -216,6 +218,11 @@ class Remote(ReleaseLocation):
     @cached_property
     def _shard_sizes(self) -> dict[str, int]:
         return read_info(self.folder).shards
+
+
+def _unset_text() -> str:
+    """Return advice for an error in offline mode: the environment variables to unset."""
+    return f"unset {' and '.join(offline_switches())} to download"
 
 
 def _fetch_with_retries(
@@ -309,7 +316,7 @@ def _open_address(address: str, to: Path | None) -> Remote:
     if offline_switches():
         path = (to or base / (latest.read_text() if latest.is_file() else "none")) / MANIFEST
         if not path.is_file():
-            raise OfflineError(f"{url}: offline, and this release is not downloaded to {path.parent}; go online")
+            raise OfflineError(f"{url}: offline, and this release is not downloaded to {path.parent}; {_unset_text()}")
         text = path.read_bytes()
     else:
         with TemporaryDirectory() as scratch:
@@ -331,7 +338,7 @@ def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | 
             path = _fetch_with_retries(client, address, MANIFEST, scratch, lambda size: None, disk.TEXT_BYTES)
     except RemoteError as error:
         if error.missing and offline_switches():
-            raise OfflineError(f"{url}: offline, and this release is not downloaded; go online") from None
+            raise OfflineError(f"{url}: offline, and this release is not downloaded; {_unset_text()}") from None
         if error.missing:
             raise RootNotFoundError(f"{url}: no release at this address, expected {MANIFEST}: {error}") from None
         raise

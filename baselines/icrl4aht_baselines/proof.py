@@ -69,7 +69,7 @@ LEARNERS = {
 
 _MODEL = ModelOptions(**{**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0})
 # The script `search` finds out the dish within the first episodes, so windows begin at a history's start.
-_FIRST_EPISODES = {"search": 5}
+_FIRST_EPISODES = {"search": 5, "all": 5}
 _TRAINING: dict[str, Any] = {"learning_rate": 2e-3, "validate_every": 10**6, "save_every": 10**6, "log_every": 20}
 
 
@@ -135,7 +135,7 @@ class ProofJob(TrainingJob):
 
     @property
     def label(self) -> str:
-        """Name of the job in progress displays: method, labels, source and seed."""
+        """Name of the job that progress displays show: method, labels, source and seed."""
         return f"{LEARNERS[self.learner].title}, {self.source} histories, seed {self.seed}"
 
     @property

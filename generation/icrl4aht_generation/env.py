@@ -225,8 +225,11 @@ class Environment:
     def episode_key(self, state: EnvState) -> Key[Array, " N"]:
         """Return the key of each running episode, which depends only on the environment's key and the episode's number.
 
-        Policies may fold the numbers 1..20 into this key. The environment folds in a step's number to draw the recipe
-        after a delivery, and no soup is done before step 20.
+        The environment folds 0 into this key to draw the start of the episode, the number of a step that delivers a
+        soup (counted from 1) to draw the next recipe, and `_LAYOUT_DRAW` to draw a layout. No soup is delivered before
+        step 22, because a pot cooks for 20 steps, so policies may fold in 1..20 for draws of their own.
+
+        `policy_player` gives the policy of agent 0 the key with 0 folded in, from which the start is also drawn.
         """
         return _fold(state.key, state.episode)
 

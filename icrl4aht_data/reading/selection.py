@@ -257,7 +257,7 @@ class Selection:
     @cached_property
     def layouts(self) -> list[Layout]:
         """The layouts of the selection, in order of appearance."""
-        # np.unique sorts by code, that is by first appearance in the release, not in the selection.
+        # np.unique sorts by layout code, that is by first appearance in the release, not in the selection.
         codes, first = np.unique(self.column_codes("layout"), return_index=True)
         names = self.index.values("layout")
         return [get_layout(names[code]) for code in codes[np.argsort(first)].tolist()]

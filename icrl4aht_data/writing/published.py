@@ -133,7 +133,10 @@ def _new_hdf5(path: Path) -> Iterator[h5py.File]:
 
 
 def _streams_per_learner(provenance: Provenance | None) -> int:
-    """Return how many stream numbers each learner of a task has in the published index."""
+    """Return how many values of `env_idx` the published index reserves for each learner of a task.
+
+    This is the number of environments in the ego's training, or 2**31 if the provenance does not record an ego.
+    """
     ego = None if provenance is None else provenance.ego
     return 2**31 if ego is None else ego["environments"]
 

@@ -21,38 +21,38 @@ def neighbour(layout: Layout, cell: int, action: int) -> int:
     return y * layout.width + x if 0 <= x < layout.width and 0 <= y < layout.height else -1
 
 
-def brute_move(layout: Layout, cell: int, action: int) -> int:
+def reference_move(layout: Layout, cell: int, action: int) -> int:
     """Return the cell to which a move leads if no other agent is in the way."""
     target = neighbour(layout, cell, action)
     return target if target >= 0 and "".join(layout.rows)[target] in " A" else cell
 
 
 @lru_cache
-def brute_distances(layout: Layout) -> np.ndarray:
+def reference_distances(layout: Layout) -> np.ndarray:
     """Return the numbers of steps between floor cells, int (cells, cells), by the Floyd-Warshall algorithm."""
     distance = np.full((layout.cells, layout.cells), NOWHERE)
     for cell, letter in enumerate("".join(layout.rows)):
         if letter in " A":
             for action in DELTA:
-                distance[cell, brute_move(layout, cell, action)] = 1
+                distance[cell, reference_move(layout, cell, action)] = 1
             distance[cell, cell] = 0
     for via in range(layout.cells):
         distance = np.minimum(distance, distance[:, via, None] + distance[via])
     return np.minimum(distance, NOWHERE)
 
 
-def brute_first_step(layout: Layout, origin: int, target: int) -> int:
+def reference_first_step(layout: Layout, origin: int, target: int) -> int:
     """Return the first of the actions right, down, left, up that starts a shortest path."""
-    left = brute_distances(layout)[origin, target]
+    left = reference_distances(layout)[origin, target]
     if left in (0, NOWHERE):
         return STAY
-    return next(a for a in SEARCH if brute_distances(layout)[brute_move(layout, origin, a), target] == left - 1)
+    return next(a for a in SEARCH if reference_distances(layout)[reference_move(layout, origin, a), target] == left - 1)
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_path_tables_equal_brute_force_search(name):
     layout = LAYOUTS[name]
     tables = layout.tables
-    np.testing.assert_array_equal(tables.distance, brute_distances(layout))
-    first = [[brute_first_step(layout, a, b) for b in range(layout.cells)] for a in range(layout.cells)]
+    np.testing.assert_array_equal(tables.distance, reference_distances(layout))
+    first = [[reference_first_step(layout, a, b) for b in range(layout.cells)] for a in range(layout.cells)]
     np.testing.assert_array_equal(tables.first_step, first)

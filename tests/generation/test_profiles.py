@@ -60,7 +60,7 @@ def test_shipped_profiles_list_valid_tasks(name):
     assert "ppo" not in profile.sources or 0 < profile.keep <= profile.ego.environments * profile.learners
     for source in profile.sources:
         for layout in profile.layouts_of(source):
-            assert profile.tasks_on(layout, source) > 0
+            assert profile.task_count(layout, source) > 0
     units = profile.units()
     assert len({work.name for work in units}) == len(units)
     for work in units:
@@ -79,7 +79,7 @@ def test_paper_profile_has_the_papers_numbers():
     assert (ego.entropy, ego.value, ego.shaping_horizon) == (0.01, 0.5, 60_000_000)
     assert ego.widths == Widths((128, 128, 8), (16, 32, 32), 128, 128, 128)
     assert profile.keep == 128
-    assert [profile.tasks_on(layout, "ppo") for layout in profile.layouts] == [80] * 8
+    assert [profile.task_count(layout, "ppo") for layout in profile.layouts] == [80] * 8
     assert profile.algorithms == dict.fromkeys(profile.layouts, ALGORITHMS)
     assert set(profile.layouts) == {layout for splits in TRACKS.values() for layout in splits["train"]}
 
@@ -133,8 +133,8 @@ def test_learned_teammates_can_be_limited_to_some_layouts(changed):
     learned = 'algorithms = { cramped_room_up = ["fcp", "comedi"], coord_simple = [] }\npresets ='
     profile = load_profile(changed("presets =", learned))
     assert profile.algorithms == {"cramped_up": ("fcp", "comedi")}
-    assert profile.tasks_on("coord_simple", "ppo") == 2
-    assert profile.tasks_on("cramped_up", "ppo") == 2 + 2 * profile.teammates.train
+    assert profile.task_count("coord_simple", "ppo") == 2
+    assert profile.task_count("cramped_up", "ppo") == 2 + 2 * profile.teammates.train
 
 
 def test_sampled_teammates_are_used_by_ppo_and_noise_tasks(changed):
@@ -219,7 +219,7 @@ def test_profile_overrides_settings_of_its_base(tmp_path):
 def test_sampled_and_spread_teammates_must_be_on_different_layouts(changed, small_lists):
     sampled = f"sampled = {{ {H3}, per_layout = {{ coord_simple = 1 }} }}"
     profile = spread_profile(changed, sampled, "per_layout = { cramped_up = 2 }")
-    assert [profile.tasks_on(layout, "noise") for layout in profile.layouts] == [1, 2]
+    assert [profile.task_count(layout, "noise") for layout in profile.layouts] == [1, 2]
     with pytest.raises(OptionError, match=r"coord_simple: 1 teammates of tasks.sampled and 3 of tasks.spread"):
         spread_profile(changed, sampled)
 

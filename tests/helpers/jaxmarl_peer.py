@@ -7,16 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxmarl.environments.overcooked_v2.common import Agent, Position
 from jaxmarl.environments.overcooked_v2.overcooked import OvercookedV2
-from jaxmarl.environments.overcooked_v2.overcooked import State as PeerState
+from jaxmarl.environments.overcooked_v2.overcooked import State as JaxmarlState
 
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import unpack
 
-TO_PEER_ACTION = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS])
+TO_JAXMARL_ACTION = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS])
 
 
-def to_peer_item(layout: Layout, item: np.ndarray) -> np.ndarray:
+def to_jaxmarl_item(layout: Layout, item: np.ndarray) -> np.ndarray:
     """Convert our item bytes to JaxMARL's item codes, which have two bits for every ingredient of the game."""
     item = item.astype(np.int32)
     code = item & 3
@@ -33,32 +33,32 @@ def to_our_item(layout: Layout, code: np.ndarray) -> np.ndarray:
     return item.astype(np.uint8)
 
 
-def to_peer_state(layout: Layout, env: OvercookedV2, records: np.ndarray) -> PeerState:
+def to_jaxmarl_state(layout: Layout, env: OvercookedV2, records: np.ndarray) -> JaxmarlState:
     """Convert state records uint8 (B, S) to JaxMARL's batched state."""
     ours = unpack(layout, records)
     batch, shape = len(records), (layout.height, layout.width)
     grid = np.zeros((batch, layout.cells, 3), np.int32)
     grid[..., 0] = np.asarray(env.layout.static_objects).reshape(-1)
-    grid[:, list(layout.pots), 1] = to_peer_item(layout, ours.pot_items)
+    grid[:, list(layout.pots), 1] = to_jaxmarl_item(layout, ours.pot_items)
     grid[:, list(layout.pots), 2] = ours.pot_timers
     grid[:, list(layout.buttons), 2] = ours.buttons
-    grid[:, list(layout.counters), 1] = to_peer_item(layout, ours.counters)
+    grid[:, list(layout.counters), 1] = to_jaxmarl_item(layout, ours.counters)
     positions = ours.positions.astype(np.int32)
-    return PeerState(
+    return JaxmarlState(
         agents=Agent(
             pos=Position(x=jnp.asarray(positions % layout.width), y=jnp.asarray(positions // layout.width)),
             dir=jnp.asarray(ours.facings.astype(np.int32)),
-            inventory=jnp.asarray(to_peer_item(layout, ours.hands)),
+            inventory=jnp.asarray(to_jaxmarl_item(layout, ours.hands)),
         ),
         grid=jnp.asarray(grid.reshape(batch, *shape, 3)),
         step=jnp.zeros(batch, jnp.int32),
         done=jnp.zeros(batch, bool),
-        recipe=jnp.asarray(to_peer_item(layout, ours.recipe)),
+        recipe=jnp.asarray(to_jaxmarl_item(layout, ours.recipe)),
         new_correct_delivery=jnp.asarray(ours.delivered > 0),
     )
 
 
-def from_peer_state(layout: Layout, state: PeerState) -> np.ndarray:
+def from_jaxmarl_state(layout: Layout, state: JaxmarlState) -> np.ndarray:
     """Convert JaxMARL's batched state to records uint8 (B, S), without the package's packing code."""
     position = np.asarray(state.agents.pos.y) * layout.width + np.asarray(state.agents.pos.x)
     grid = np.asarray(state.grid).reshape(len(position), layout.cells, 3)
@@ -76,7 +76,7 @@ def from_peer_state(layout: Layout, state: PeerState) -> np.ndarray:
     return np.concatenate([np.asarray(column) for column in columns], axis=1).astype(np.uint8)
 
 
-def peer_step(env: OvercookedV2):
+def jaxmarl_step(env: OvercookedV2):
     """Return a jitted batched step of JaxMARL's environment: (keys, states, actions (B, 2) in JaxMARL's ids)."""
 
     def single_step(key, state, actions):

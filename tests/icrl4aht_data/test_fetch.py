@@ -125,15 +125,15 @@ def test_a_remote_release_equals_its_local_copy(kind, lite, monkeypatch):
 def test_offline_mode_reads_only_downloaded_files(kind, lite, variable, monkeypatch):
     with serve_release(kind, lite[0]) as (url, _):
         monkeypatch.setenv(variable, "1")
-        with pytest.raises(OfflineError, match="offline, and this release is not downloaded"):
+        message = rf"offline, and this release is not downloaded.*; unset {variable} to download"
+        with pytest.raises(OfflineError, match=message):
             load_icrl4aht(url)
         monkeypatch.delenv(variable)
         fetch_planned(plan_download(url, layout="demo_wide"))
         monkeypatch.setenv(variable, "1")
         assert_equal(load_batch(url), load_batch(lite[0]))
-        with pytest.raises(
-            OfflineError, match=r"offline, but these files are missing.*: .*data/teammate/coord_simple/train-0"
-        ):
+        message = rf"offline, but these files are missing.*: .*data/teammate/coord_simple/train-0.*; unset {variable}"
+        with pytest.raises(OfflineError, match=message):
             load_batch(url, "coord_simple", cache="ram")
 
 

@@ -83,7 +83,7 @@ def bundled_tasks(split: str, kind: Literal["", "diverse"] = "") -> list[Task]:
 def paper_plan_sizes() -> tuple[float, ...]:
     """Return the numbers of learners, environment steps, recorded and kept transitions in profile `paper`."""
     profile = load_profile("paper")
-    ego, count = profile.ego, sum(profile.tasks_on(name, "ppo") for name in profile.layouts)
+    ego, count = profile.ego, sum(profile.task_count(name, "ppo") for name in profile.layouts)
     steps = ego.episodes * KEPT_STEPS
     total = count * ego.updates * ego.steps_per_update
     return count, total, count * ego.environments * steps, count * profile.keep * steps

@@ -22,7 +22,7 @@ uploads = pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning")
 
 
 @contextmanager
-def environment(changes: Mapping[str, str | None]) -> Iterator[None]:
+def environment_variables(changes: Mapping[str, str | None]) -> Iterator[None]:
     """Set environment variables within a context; the value None removes a variable."""
     with mock.patch.dict(os.environ):
         for name, value in changes.items():
@@ -57,7 +57,7 @@ def hub_settings(variables: Mapping[str, str]) -> Iterator[None]:
     the client makes on import. The client's HTTP session is closed before and after.
     """
     changes, before = _changed_constants(variables), constants.ENDPOINT
-    with environment({**variables, **dict.fromkeys(REMOVED)}):
+    with environment_variables({**variables, **dict.fromkeys(REMOVED)}):
         try:
             _replace_constants(changes)
             _reset_client(variables["HF_ENDPOINT"])

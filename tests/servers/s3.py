@@ -11,7 +11,7 @@ from pathlib import Path
 import boto3
 from moto.server import ThreadedMotoServer
 
-from tests.servers.process import environment
+from tests.servers.process import environment_variables
 
 
 @contextmanager
@@ -31,7 +31,7 @@ def s3_server(folder: Path, bucket: str = "data") -> Iterator[str]:
     }
     try:
         # The user's AWS profile or session token would take precedence over the keys above.
-        with environment({**variables, "AWS_PROFILE": None, "AWS_SESSION_TOKEN": None}):
+        with environment_variables({**variables, "AWS_PROFILE": None, "AWS_SESSION_TOKEN": None}):
             client = boto3.Session().client("s3")
             client.create_bucket(Bucket=bucket)
             for path in sorted(folder.rglob("*")):

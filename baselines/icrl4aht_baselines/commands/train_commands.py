@@ -135,10 +135,10 @@ def report_command(
 ) -> None:
     """Compare results with the paper's.
 
-    RESULTS are folders that `evaluate` made. Prints a summary of each agent, and tables of returns. Results of protocol
-    published are shown next to the paper's numbers. Scores with teammates or on layouts that were in training are
-    marked. Writes the tables as report.md, and all numbers as report.csv. Results of one agent on different layouts
-    are merged.
+    RESULTS are folders that `evaluate` made. Prints a summary of each agent, and tables of returns. Results under the
+    protocol `published` are shown next to the paper's numbers. Scores with teammates or on layouts that were in
+    training are marked. Writes the tables as report.md, and all numbers as report.csv. Results of one agent on
+    different layouts are merged.
     """
     from icrl4aht_baselines.report import page
     from icrl4aht_baselines.report.results import merge, read_run

@@ -180,7 +180,7 @@ class ResponseJob(EgoJob):
 
     @property
     def label(self) -> str:
-        """Name of the job in progress displays: layout, teammate and seed."""
+        """Name of the job that progress displays show: layout, teammate and seed."""
         task, others = self.tasks[0], len(self.tasks) - 1
         alike = f" and {others} alike" if others else ""
         return f"{task.layout.name} {task.teammate_family}/t{task.teammate['theta_id']}{alike}, seed {self.seed}"
@@ -197,10 +197,11 @@ class ResponseJob(EgoJob):
         return "return " + ", ".join(f"{mode} {found['return']:.1f}" for mode, found in modes.items())
 
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
-        """Train the ego, and measure its returns on the episodes to choose by ("choice") and to report ("return").
+        """Train the ego, and measure its returns in episodes with other seeds than in training.
 
-        Returns are means over the tasks, with the most probable actions ("greedy") and with sampled actions
-        ("sampled"). "slope" is the training return in the last quarter of the steps minus that in the third quarter.
+        "choice" is the mean return over the tasks with `CHOICE_SEEDS`, "return" that with `REPORT_SEEDS`; both are
+        measured with the most probable actions ("greedy") and with sampled actions ("sampled"). "slope" is the training
+        return in the last quarter of the steps minus that in the third quarter.
         """
         task, params = self.tasks[0], None
         if self.options.init:
@@ -230,7 +231,7 @@ class ResponseJob(EgoJob):
 
 
 def trained_response(job: ResponseJob) -> TrainedResponse:
-    """Return the record of a finished training run, for the play mode that earns more on the episodes to choose by."""
+    """Return the record of a finished training run, for the play mode that earns more with `CHOICE_SEEDS`."""
     result = job.result()
     acting, earned = max(result["modes"].items(), key=lambda mode: mode[1]["choice"])
     return TrainedResponse(
@@ -248,8 +249,9 @@ def trained_response(job: ResponseJob) -> TrainedResponse:
 def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainedResponse]) -> BestResponse:
     """Return the best response to tasks whose teammates behave the same, from several training runs.
 
-    The run with the highest return on the episodes to choose by is the best; B is its return on the reported
-    episodes. Of several runs with the same seed, initial model, steps and width, only the last is used.
+    The run with the highest mean return in episodes with the seeds `CHOICE_SEEDS` is chosen. The result's field `best`
+    is the mean return of this run in other episodes, with the seeds `REPORT_SEEDS`. Of several runs with the same seed,
+    initial model, steps and width, only the last is used.
     """
     task, seeds = tasks[0], {(one.init, one.steps, one.width, one.seed): one for one in trainings}
     best = chosen_training(seeds.values())

@@ -80,7 +80,7 @@ _KIND_OF_SPLIT = {"validation": "validation", "train": "training", "heldout": "h
 
 
 class ResultCell(NamedTuple):
-    """Result cell: all tasks with the same layout, teammate family and kind, over which reports average.
+    """Result cell (layout, family of teammates, kind of tasks): the tasks over which reports average.
 
     Attributes:
         layout: name of the layout.

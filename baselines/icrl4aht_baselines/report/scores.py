@@ -180,7 +180,10 @@ class Score(NamedTuple):
 
 
 def find_score(returns: AgentReturns, cells: Sequence[ResultCell], scales: CellScales) -> Score | None:
-    """Return an agent's score on some cells; None if a cell has no headroom or was not played completely."""
+    """Return an agent's score on some result cells (layout, family of teammates, kind of tasks).
+
+    The result is None if there are no cells, or a cell has no headroom or was not played completely.
+    """
     if not cells or not all(is_scored(returns.get(cell), scales.get(cell)) for cell in cells):
         return None
     groups: dict[str, list[Stratum]] = defaultdict(list)
@@ -325,7 +328,11 @@ def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str
 
 
 def blocks_text(cells: Sequence[CellReturns]) -> str:
-    """Return text with the mean return over cells in each block of episodes, such as "1: 10.0, 2-5: 12.0"."""
+    """Return text with the mean return in each block of episodes, such as "1: 10.0, 2-5: 12.0".
+
+    Args:
+        cells: returns of an agent in several result cells (layout, family of teammates, kind of tasks).
+    """
     # The cells may have different numbers of episodes, so only blocks that all of them have are shown.
     names = [name for name in EPISODE_BLOCKS if all(name in of.blocks for of in cells)]
     return ", ".join(f"{name}: {mean_of(of.blocks[name] for of in cells):z.1f}" for name in names)

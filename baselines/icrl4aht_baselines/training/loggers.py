@@ -60,7 +60,8 @@ def _wandb(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
         with _temporary_entry(os.environ, "WANDB_MODE", mode):
             started = wandb.init(project, name=run.name, dir=run, config=dict(config), settings=settings)
     except wandb.Error as error:
-        raise OptionError(f"wandb with WANDB_MODE={mode}: {error} WANDB_MODE=offline needs no account") from error
+        reason = str(error).rstrip(".")
+        raise OptionError(f"wandb with WANDB_MODE={mode}: {reason}; WANDB_MODE=offline needs no account") from error
     try:
         yield lambda line: started.log(_prefixed(line), step=line["step"])
     finally:

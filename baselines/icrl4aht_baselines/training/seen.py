@@ -83,7 +83,7 @@ OVERLAPS = {
     "family": (
         "†",
         "the agent was trained with other teammates of this family, or of this algorithm if they are learned; members "
-        "of a family may act alike, so this is no result with unknown kinds of teammates",
+        "of a family may act alike, so this score does not show how the agent plays with unknown kinds of teammates",
     ),
     "layout": ("§", "the agent was trained on this layout, which the track reserves for tests"),
     "unknown": ("?", "unknown training data: nothing says what the agent was trained on"),

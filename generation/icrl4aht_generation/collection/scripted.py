@@ -1,4 +1,4 @@
-"""Generate the artefact of a task with a scripted source, `noise` or `search`, without a learner.
+"""Generate the artefact of a task of source `noise` or `search`, in which a script plays the ego instead of a learner.
 
 A task takes seconds, so a killed task restarts from the beginning; the result is identical.
 

@@ -127,7 +127,12 @@ def partial_folder(folder: Path) -> Path:
 
 
 def checkpoint_path(folder: Path, number: int) -> Path:
-    """Return the folder of the ego's checkpoint with a given number in an artefact."""
+    """Return the folder of one of the ego's checkpoints in an artefact.
+
+    Args:
+        folder: the artefact's folder.
+        number: number of the checkpoint, from 0.
+    """
     return folder / "checkpoints" / f"c{number}"
 
 

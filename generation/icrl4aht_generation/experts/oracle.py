@@ -197,13 +197,18 @@ class OracleView:
 
     @cached_property
     def plan_costs(self) -> Int[Array, "P Q"]:
-        """Cost of cooking each recipe in each pot; lower for recipes with few soups in stock, then with little work."""
+        """Cost of cooking each recipe in each pot; NEVER if the ego should not cook the recipe in this pot.
+
+        The cost increases first with the number of soups of the recipe in stock, then with the remaining work.
+        """
         trip = jnp.asarray(self.facts.trip)[:, None]
         enough = jnp.all((self.missing >= 0) & ((self.missing == 0) | (trip < FAR)), axis=-1)
         # A surplus ingredient makes a recipe impossible: nothing can be taken out of a pot.
         possible = enough & (self.facts.pots & ~self.full)[:, None]
         current, short = self.recipes == self.recipes[0], self.stock[0] == 0
-        # If the teammate cooks, cook ahead only in pots that it does not use, or if the current recipe is impossible.
+        # If the teammate cooks, the ego cooks only the current recipe while no soup of this recipe is in stock, or any
+        # recipe if the current one is impossible. With a soup in stock, the ego cooks ahead, but only in pots that the
+        # teammate does not use.
         wanted = jnp.where(short, current, jnp.asarray(self.facts.passed)[:, None]) | (short & ~jnp.any(possible[:, 0]))
         work = jnp.sum(self.missing * jnp.minimum(trip, FAR // 10), axis=-1)
         # A soup in stock counts more than any walk, because walks are shorter than 200 steps.
@@ -346,7 +351,8 @@ def _plate_subgoals(view: OracleView) -> list[Subgoal]:
     holds, building = view.scene.holds_plate, jnp.min(view.plan_costs) < NEVER
     right = view.right & ~view.teammate_pots
     soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
-    # The ego waits in front of a soup that is not done, so waiting counts like walking.
+    # The ego has to wait for a soup that is not done on its arrival. Each step of waiting costs as much as a step of
+    # walking.
     rest = jnp.maximum(view.timers - view.pot_times, 0)
     return [
         # Plate the soup of the current recipe.

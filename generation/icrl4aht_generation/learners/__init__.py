@@ -1,1 +1,1 @@
-"""The network and the PPO implementation that all learning algorithms share, and the learners."""
+"""Learners of egos and populations, and the network and PPO implementation that they share."""

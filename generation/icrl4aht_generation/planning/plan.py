@@ -92,7 +92,7 @@ def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
     tasks, kept, histories = 0, Counter[str](), Counter[str]()
     for source in profile.sources:
         for name in profile.layouts_of(source):
-            layout, count = get_layout(name), profile.tasks_on(name, source)
+            layout, count = get_layout(name), profile.task_count(name, source)
             tasks += count
             if source == "ppo":
                 egos += [(layout, profile.ego_on(name))] * (count * profile.learners)

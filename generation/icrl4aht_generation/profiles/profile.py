@@ -203,7 +203,10 @@ class Profile:
                 )
 
     def with_ego(self, given: Mapping[str, Any]) -> Profile:
-        """Return the profile with some of the ego's hyper-parameters replaced on every layout, nested as in TOML.
+        """Return a copy of the profile with other hyper-parameters of the ego, which apply to every layout.
+
+        Args:
+            given: new values of hyper-parameters by name, such as {"widths": {"gru": 4}}; others are kept.
 
         Raises:
             OptionError: if a value is invalid.
@@ -269,7 +272,7 @@ class Profile:
         learners = self.learners if source == "ppo" else 1
         return [Work(task, source, learner) for task in tasks for learner in range(learners)]
 
-    def tasks_on(self, layout: str, source: str) -> int:
+    def task_count(self, layout: str, source: str) -> int:
         """Return the number of tasks of a source on a layout, assuming enough good teammates in every population."""
         learned = len(self.algorithms.get(layout, ())) * self.teammates.train * (source != "search")
         return len(self._heuristic_tasks(layout, source)) + learned

@@ -176,7 +176,10 @@ def release_provenance(root: Path) -> dict[str, Provenance]:
 
 
 def recorded_provenance(suite: Path) -> dict[str, Provenance]:
-    """Return the provenance, by task id, of a release that contains a folder of teammates; empty for a suite."""
+    """Return the provenance, by task id, of the release that a folder of learned teammates belongs to.
+
+    The result is empty for a suite, which belongs to no release.
+    """
     return release_provenance(suite.parent) if suite.name == TEAMMATES else {}
 
 

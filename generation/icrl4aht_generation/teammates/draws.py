@@ -100,7 +100,10 @@ class Draw(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def nearest_counted(self) -> tuple[float, str]:
-        """Distance to the nearest test instance that decides whether the draw is admissible, and its name."""
+        """Distance and name of the test instance with the most similar behaviour, which `admissible` depends on.
+
+        Only test instances of the same family count, or those of all families for a diverse draw.
+        """
         own, other = (self.distance, self.nearest), (self.other_distance, self.other)
         diverse = self.base_seed in _DIVERSE_SEEDS.values()
         return other if diverse and other[0] < own[0] else own

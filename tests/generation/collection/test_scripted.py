@@ -242,7 +242,7 @@ def test_scripted_histories_can_have_a_learned_teammate(profile, tmp_path):
 
 @pytest.mark.slow
 def test_generate_check_and_verify_commands_accept_scripted_histories(tmp_path):
-    """A release is valid, and its tasks collected again in a new process, in batches of 256 episodes, are equal."""
+    """A release is valid. Collecting it again in new processes, in batches of 256 episodes, gives an equal release."""
     (tmp_path / "noise.toml").write_text(NOISE)
     command = ("generate", "--profile", tmp_path / "noise.toml", "--out")
     again = ("--tasks", tmp_path / "a/lite/meta/tasks.jsonl", "--workers", 2)

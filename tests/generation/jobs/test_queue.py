@@ -77,7 +77,10 @@ def test_jobs_that_another_process_runs_come_last(tmp_path):
 
 
 def test_jobs_in_local_processes_are_retried_and_reported(tmp_path):
-    """Run four jobs in two processes: a busy one, one that fails once, one that always fails, and a killed one."""
+    """Two processes run four jobs, with one retry. Job `killed` kills its process, and job `bad` always fails.
+
+    Job `busy` seems to run in another process until the queue waits for it. Job `later` succeeds in its second attempt.
+    """
     jobs = [FileJob(tmp_path, "killed", killed=True), FileJob(tmp_path, "busy", busy=True)]
     jobs += [FileJob(tmp_path, "bad", failures=9), FileJob(tmp_path, "later", failures=1)]
     with pytest.raises(FailedJobsError, match=r"2 of 4 jobs are unfinished: bad, killed; .*lists the reasons"):

@@ -124,12 +124,12 @@ def test_population_update_equals_separate_updates_of_each_policy(lbrdiv, learn)
     weight = np.asarray(trained._slot_weights(before.memory))
     (group,) = trained.groups
 
-    def sequences_of_all(state, carry, rollout):
+    def sequences_of_all_slots(state, carry, rollout):
         last = trained._players(state.params)[0].act(carry.memories[0], carry.env, key)[0].value
         shaping = shaping_weight(CONFIG, state.update)
         return sequences(trained.view, rollout, 0, group.agent_slots.ravel(), state.carry.memories[0], last, shaping)
 
-    everyone = jax.tree.map(np.asarray, jax.jit(sequences_of_all)(before, lbrdiv.carry, lbrdiv.rollout))
+    everyone = jax.tree.map(np.asarray, jax.jit(sequences_of_all_slots)(before, lbrdiv.carry, lbrdiv.rollout))
     for number in range(4):
         slots = assignment.agent_slots(number)[0]
         chosen = np.array([group.agent_slots.ravel().tolist().index(slot) for slot in slots])

@@ -16,12 +16,12 @@ from tests.helpers.tiny import NOISE, artefact
 
 
 @pytest.fixture
-def measured(monkeypatch) -> None:
+def fixed_speeds(monkeypatch) -> None:
     """Replace measured speeds: egos train at 100,000 steps/s, and populations at 50,000 steps/s."""
     monkeypatch.setattr(plan, "step_seconds", lambda config: 1e-5 if config.environments == 1024 else 2e-5)
 
 
-def test_cost_of_profile_paper_matches_numbers_of_the_paper(measured):
+def test_cost_of_profile_paper_matches_numbers_of_the_paper(fixed_speeds):
     """The paper has 8 layouts with 80 teammates each, from populations of 10 members with 256 environments each.
 
     A history has T = 146 x 100 = 14,600 steps (paper, App. D.1): in 228 updates, or 58,368 steps, the 146th episode

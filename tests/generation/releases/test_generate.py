@@ -1,4 +1,4 @@
-"""Tests of rebuilds of tiny profiles: collected tasks, packaged releases, learned teammates and invalid folders."""
+"""Generate releases from tiny profiles: collected tasks, packaged releases, learned teammates and invalid folders."""
 
 from __future__ import annotations
 

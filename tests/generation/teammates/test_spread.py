@@ -67,7 +67,7 @@ def test_spread_candidates_are_distinct_and_valid():
     found = spread_candidates()
     assert {entry["base_seed"] for entry in found} == {SPREAD_SEED}
     assert len({(entry["family"], entry["theta_id"]) for entry in found}) == len(found)
-    assert all(0 <= entry["theta_id"] < 500 for entry in found)  # larger ids would give tasks equal seeds
+    assert all(0 <= entry["theta_id"] < 500 for entry in found)  # with larger ids, two tasks could have the same seed
     assert {entry["family"] for entry in found} == set(HEURISTIC_FAMILIES)
     assert teammate_id(WATCHER) in {teammate_id(entry) for entry in found}
     for entry in found:

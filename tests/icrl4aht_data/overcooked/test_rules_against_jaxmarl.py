@@ -11,7 +11,7 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe_both
 from icrl4aht_data.overcooked.rules import step
 from icrl4aht_data.overcooked.state import columns
-from tests.helpers.jaxmarl_peer import TO_PEER_ACTION, from_peer_state, peer_step, to_peer_state
+from tests.helpers.jaxmarl_peer import TO_JAXMARL_ACTION, from_jaxmarl_state, jaxmarl_step, to_jaxmarl_state
 from tests.helpers.states import random_records
 
 BATCH, STEPS, SCENES = 512, 20, 20  # 10,240 steps of trajectories, then 10,240 single steps from random states
@@ -30,7 +30,7 @@ DEFAULT = ("coord_ring",)  # this layout has buttons; all other layouts are slow
 def test_step_rewards_and_observations_equal_jaxmarl(layout):
     rng = np.random.default_rng(0)
     env = jaxmarl_environment(layout)
-    advance = peer_step(env)
+    advance = jaxmarl_step(env)
     events = 0
     records = random_records(layout, BATCH, rng)
     for number in range(STEPS + SCENES):
@@ -38,8 +38,9 @@ def test_step_rewards_and_observations_equal_jaxmarl(layout):
             records = random_records(layout, BATCH, rng)
         actions = np.where(rng.random((BATCH, 2)) < 0.5, 5, rng.integers(0, 6, (BATCH, 2)))
         keys = jax.random.split(jax.random.PRNGKey(number), BATCH)
-        observed, peer, reward, shaped = advance(keys, to_peer_state(layout, env, records), TO_PEER_ACTION[actions])
-        expected = from_peer_state(layout, peer)
+        states = to_jaxmarl_state(layout, env, records)
+        observed, after, reward, shaped = advance(keys, states, TO_JAXMARL_ACTION[actions])
+        expected = from_jaxmarl_state(layout, after)
         ours = step(layout, records, actions, expected[:, columns(layout).recipe])
         np.testing.assert_array_equal(ours.state, expected)
         np.testing.assert_array_equal(ours.reward, np.asarray(reward))

@@ -64,7 +64,9 @@ def sorted_names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def write_cramped_up(root: Path, load: Callable[[], list[NewHistory]], streams: int = 1, **options: Any) -> None:
+def write_cramped_up_release(
+    root: Path, load: Callable[[], list[NewHistory]], streams: int = 1, **options: Any
+) -> None:
     """Write a release of one task on cramped_up with episodes of 10 steps."""
     (task,) = make_tasks(["cramped_up"])
     new = NewTask(task, Provenance(), streams, load)
@@ -94,7 +96,7 @@ def raise_error() -> list[NewHistory]:
 )
 def test_invalid_histories_are_refused_without_leftovers(tmp_path, spoil, streams, message):
     with pytest.raises(OptionError, match=message):
-        write_cramped_up(
+        write_cramped_up_release(
             tmp_path / "out",
             lambda: [NewHistory(k, spoil(random_arrays())) for k in (0, 1)],
             streams,
@@ -108,9 +110,9 @@ def test_failed_overwrite_keeps_the_old_release(tmp_path):
     random_release(root, seed=1)
     before = (root / "MANIFEST.sha256").read_bytes()
     with pytest.raises(OptionError, match="release: exists; give another folder, or use --overwrite to replace it"):
-        write_cramped_up(root, raise_error)
+        write_cramped_up_release(root, raise_error)
     with pytest.raises(RuntimeError, match="no data"):
-        write_cramped_up(root, raise_error, overwrite=True)
+        write_cramped_up_release(root, raise_error, overwrite=True)
     assert (root / "MANIFEST.sha256").read_bytes() == before
     assert verify_release(root).ok
     random_release(root, seed=2, overwrite=True)
@@ -132,7 +134,7 @@ def test_second_writer_of_a_release_is_refused(tmp_path):
             random_release(tmp_path / "release")
         return [NewHistory(0, random_arrays())]
 
-    write_cramped_up(tmp_path / "release", load_during_write)
+    write_cramped_up_release(tmp_path / "release", load_during_write)
     assert verify_release(tmp_path / "release").histories == 1
 
 
@@ -142,7 +144,7 @@ def test_release_is_restored_after_a_kill_between_the_two_renames(tmp_path):
     (tmp_path / "release").rename(tmp_path / ".release.old")
     (tmp_path / ".release.partial").mkdir()
     with pytest.raises(OptionError, match="release: exists"):
-        write_cramped_up(tmp_path / "release", raise_error)
+        write_cramped_up_release(tmp_path / "release", raise_error)
     assert (tmp_path / "release" / "MANIFEST.sha256").read_bytes() == before
 
 
@@ -178,9 +180,9 @@ def test_overwrite_refuses_folders_with_other_files(tmp_path, make, message):
     make(root)
     before = contents(tmp_path)
     with pytest.raises(OptionError, match="exists; give another folder, or use --overwrite to replace it"):
-        write_cramped_up(root, raise_error)
+        write_cramped_up_release(root, raise_error)
     with pytest.raises(OptionError, match=message):
-        write_cramped_up(root, raise_error, overwrite=True)
+        write_cramped_up_release(root, raise_error, overwrite=True)
     assert contents(tmp_path) == before
 
 
@@ -193,7 +195,7 @@ def test_folders_created_during_writing_are_not_replaced(tmp_path):
 
     for overwrite, message in ((False, "exists"), (True, r"contains note\.txt")):
         with pytest.raises(OptionError, match=message):
-            write_cramped_up(root, load_during_write, overwrite=overwrite)
+            write_cramped_up_release(root, load_during_write, overwrite=overwrite)
         assert (root / "note.txt").read_text() == "mine"
         shutil.rmtree(root)
         random_release(root, seed=1)

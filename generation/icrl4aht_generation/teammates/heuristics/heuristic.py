@@ -79,7 +79,7 @@ class Heuristic:
 
         Args:
             layout: layout of the state records that the teammate sees; None for a teammate that sees a `Situation`.
-            theta: a value for every parameter, and perhaps for `RANDOM_ACTIONS`.
+            theta: a value for every parameter, and the optional `RANDOM_ACTIONS`.
             slot: 0 or 1, the agent that the teammate plays.
             noise: source of the teammate's randomness.
         """
@@ -94,7 +94,7 @@ class Heuristic:
 
     @cached_property
     def theta_type(self) -> type[msgspec.Struct]:
-        """Type of the parameters for validation by msgspec: all of `defaults`, and perhaps `RANDOM_ACTIONS`."""
+        """Type of the parameters for validation by msgspec: all of `defaults`, and the optional `RANDOM_ACTIONS`."""
         most = {name: number - 1 for name, number in self.choices.items()} | dict.fromkeys(self.unbounded, 2**31 - 1)
         fields = [
             (name, Annotated[type(default), Meta(ge=0, le=most.get(name, 1))])
