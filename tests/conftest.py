@@ -101,7 +101,7 @@ def temporary_cache(tmp_path_factory) -> None:
 
 @pytest.fixture(scope="session")
 def shared_folder(tmp_path_factory) -> SharedFolder:
-    """Return a function (name, make) that returns a folder; the first worker fills the folder by `make`. Read only."""
+    """Return a function (name, make) that returns a folder; the first worker fills the folder by `make` (read-only)."""
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
@@ -119,14 +119,14 @@ def shared_folder(tmp_path_factory) -> SharedFolder:
 
 @pytest.fixture(scope="session")
 def lite(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """A lite release of random play, and the arrays written to it by history id. Read only."""
+    """Return a lite release of random play, and the arrays written to it by history id (read-only)."""
     root = tmp_path_factory.mktemp("releases") / "lite"
     return root, random_release(root, "lite")
 
 
 @pytest.fixture(scope="session")
 def full(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """A full release with the histories of the fixture `lite`. Read only."""
+    """Return a full release with the histories of the fixture `lite`, and its arrays (read-only)."""
     root = tmp_path_factory.mktemp("releases") / "full"
     return root, random_release(root, "full")
 
@@ -139,14 +139,14 @@ def lite_or_full(request) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
 
 @pytest.fixture(scope="session")
 def two_sources(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """A lite release with both sources (PPO and noise), two splits and all labels, and its arrays. Read only."""
+    """Return a lite release with PPO and noise histories, two splits and all labels, and its arrays (read-only)."""
     root = tmp_path_factory.mktemp("releases") / "two_sources"
     return root, two_source_release(root)
 
 
 @pytest.fixture
 def damaged(lite, tmp_path) -> Path:
-    """A copy of the fixture `lite` that a test may damage."""
+    """Return a copy of the fixture `lite` that a test may damage."""
     root = tmp_path / "release"
     shutil.copytree(lite[0], root)
     return root
@@ -154,7 +154,7 @@ def damaged(lite, tmp_path) -> Path:
 
 @pytest.fixture(scope="session")
 def built(shared_folder) -> Path:
-    """A folder with tiny.toml, and `a`: the lite and full releases generated from tiny.toml. Read only."""
+    """Return a folder with tiny.toml and, in `a`, the lite and full releases generated from it (read-only)."""
 
     def make(folder: Path) -> None:
         (folder / "tiny.toml").write_text(TINY)
@@ -167,14 +167,14 @@ def built(shared_folder) -> Path:
 
 @pytest.fixture(scope="session")
 def published_folder(tmp_path_factory) -> tuple[Path, list[dict[str, np.ndarray]]]:
-    """Small files in the published format, written by hand, and their arrays. Read only."""
+    """Return small files in the published format, written by hand, and their arrays (read-only)."""
     folder = tmp_path_factory.mktemp("theirs") / "files"
     return folder, publish(folder)
 
 
 @pytest.fixture(scope="session")
 def converted_release(published_folder, tmp_path_factory) -> Path:
-    """The release of observations converted from the fixture `published_folder`. Read only."""
+    """Return the release of observations converted from the fixture `published_folder` (read-only)."""
     root = tmp_path_factory.mktemp("ours") / "release"
     assert from_published(published_folder[0], root, kept_steps=KEPT) == "observations"
     return root
@@ -182,7 +182,7 @@ def converted_release(published_folder, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def reconverted_release(lite, tmp_path_factory) -> Path:
-    """The fixture `lite` converted to published files without states and back to a release. Read only."""
+    """Return the fixture `lite`, converted to published files without states and back to a release (read-only)."""
     folder = tmp_path_factory.mktemp("twin")
     to_published(load_icrl4aht(lite[0]), folder / "files", states=False)
     with h5py.File(folder / "files" / "histories.h5") as file:

@@ -162,7 +162,7 @@ def _contradictions(made: Provenance, entries: Sequence[Entry], seed: int | None
     episodes = noise.get("episodes")
     stream, learner = (max(entries, key=attrgetter(name)) for name in ("env_idx", "learner"))
     other = next((entry for entry in entries if entry.episodes != episodes), first)
-    # Each check has a name, a value, a relation, a bound and the bound in words; None means unknown.
+    # Checks have a name, value, relation, bound and text of the bound; value or bound None is unknown and not checked.
     checks: list[tuple[str, Any, Callable[[Any, Any], bool], Any, str]] = [
         ("seed", made.seed, eq, seed, "the task's {}"),
         ("ego_hash", made.ego_hash, eq, made.ego and json_hash(made.ego), "{} of `ego`"),

@@ -234,11 +234,11 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
 
     def stored_fields(self, kind: Kind) -> tuple[Field, ...]:
         """Return the fields that a release of the given kind stores for this history."""
-        return tuple(field for field in FIELDS.values() if kind not in field.absent and self._stores(field))
+        return tuple(field for field in FIELDS.values() if kind not in field.absent and self._has_stored(field))
 
     def has(self, field: Field) -> bool:
         """Return whether the history has an optional field, see `Field.optional`; True for other fields."""
-        return self._stores(self.stored_field(field))
+        return self._has_stored(self.stored_field(field))
 
     def stored_field(self, field: Field) -> Field:
         """Return the field that stores the values of a field.
@@ -249,7 +249,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         same = field.name == "oracle_actions" and self.source == "noise" and not self.has_oracle_actions
         return FIELDS["expert_actions"] if same else field
 
-    def _stores(self, field: Field) -> bool:
+    def _has_stored(self, field: Field) -> bool:
         return getattr(self, f"has_{field.name}", True)
 
     def rows(self, field: Field) -> int:

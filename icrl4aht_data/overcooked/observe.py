@@ -77,7 +77,7 @@ def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
     me, other = state.positions[..., agent], state.positions[..., 1 - agent]
 
     view = look_up(tables.view, me)
-    changing = _changing_words(xp, state)
+    changing = _packed_changing_cells(xp, state)
     cells = xp.take_along_axis(changing, view & NOWHERE, axis=-1) | xp.astype(view >> 8, xp.uint32) << FIXED_BIT
 
     bodies = 1 | xp.astype(1 << (xp.astype(state.facings, xp.uint32) + 1), xp.uint32)
@@ -95,8 +95,8 @@ def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
     return agents, cells
 
 
-def _changing_words(xp, state: State) -> Array:
-    """Return the cells' changing words uint32 (B, 3 + P + L + K): 0, indicator, goal, pots, buttons, counters."""
+def _packed_changing_cells(xp, state: State) -> Array:
+    """Return packed words uint32 (B, 3 + P + L + K) of changing cells: 0, indicator, goal, pots, buttons, counters."""
     # The shift by 2 removes the plate and cooked flags, which a recipe never has.
     recipe = xp.astype(state.recipe >> 2, xp.uint32)[..., None] << RECIPE_BIT
     delivered = xp.astype(state.delivered, xp.uint32)[..., None] << DELIVERY_BIT

@@ -1,4 +1,4 @@
-"""The demo with a tiny model on few histories; the slow test uses the bundled release."""
+"""Test the demo with a tiny model on few histories; the slow test uses the bundled release."""
 
 from __future__ import annotations
 

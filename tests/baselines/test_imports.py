@@ -1,4 +1,4 @@
-"""Names that users import from the package icrl4aht_baselines."""
+"""Test the names that users import from the package icrl4aht_baselines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of training logs: few panels, one legend, and shared axes of returns."""
+"""Test figures of training logs: few panels, one legend, and shared axes of returns."""
 
 from __future__ import annotations
 

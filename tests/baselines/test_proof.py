@@ -1,4 +1,4 @@
-"""Models trained on a release to show what they learn: jobs, stored returns, and the table in the release's card."""
+"""Test training models on a release to show what they learn: jobs, stored returns, and the card's table."""
 
 from __future__ import annotations
 

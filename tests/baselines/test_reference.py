@@ -1,4 +1,4 @@
-"""Reference models: training recipes, the steps that make the models, and resumed commands."""
+"""Test reference models: training recipes, the steps that make the models, and resumed commands."""
 
 from __future__ import annotations
 

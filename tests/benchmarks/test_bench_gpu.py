@@ -1,4 +1,4 @@
-"""The GPU benchmark: tiny sizes run on a CPU, and programs of full size are lowered for CUDA."""
+"""Test the GPU benchmark: run tiny sizes on a CPU, and lower programs of full size for CUDA."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Benchmark cases that run in child processes, which may crash, fail, print text or hang."""
+"""Test benchmark cases in child processes, which may crash, fail, print text or hang."""
 
 from __future__ import annotations
 

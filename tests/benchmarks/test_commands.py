@@ -1,4 +1,4 @@
-"""The benchmark commands at the smallest scale run and print consistent numbers."""
+"""Test that the benchmark commands run at the smallest scale and print consistent numbers."""
 
 from __future__ import annotations
 

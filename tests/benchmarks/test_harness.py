@@ -1,4 +1,4 @@
-"""Counting the floating-point operations of matrix products in a program."""
+"""Test counting the floating-point operations of matrix products in a program."""
 
 from __future__ import annotations
 

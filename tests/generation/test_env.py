@@ -1,4 +1,4 @@
-"""The JAX environment: starts, episodes, keys and recipes, and equality of rules in JAX and NumPy."""
+"""Test the JAX environment: episode starts and ends, random keys, recipes, and rules equal to NumPy's."""
 
 from __future__ import annotations
 

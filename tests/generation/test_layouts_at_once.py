@@ -1,4 +1,4 @@
-"""Environments with several layouts in one batch play like environments with a single layout."""
+"""Test that environments with several layouts in one batch play like those with a single layout."""
 
 from __future__ import annotations
 

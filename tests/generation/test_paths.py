@@ -1,4 +1,4 @@
-"""Tables of shortest paths, compared with brute-force search."""
+"""Test tables of shortest paths against a brute-force search."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Profiles of releases, the tasks that profiles list, and task files."""
+"""Test profiles of releases, the tasks that profiles list, and task files."""
 
 from __future__ import annotations
 

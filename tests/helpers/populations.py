@@ -31,7 +31,7 @@ def population(algorithm: Algorithm, config: PPOConfig = CONFIG, **options: Any)
 
 
 def paper_adapt(old: Multipliers, returns: np.ndarray, seen: np.ndarray, tolerance: float, rate: float) -> Multipliers:
-    """Return the multipliers by the LBRDiv paper, entry by entry; [i, j]: confederate i with best response j."""
+    """Return the LBRDiv paper's multipliers; entry [i, j] is for confederate i with best response j."""
     k = len(old.vertical)
     vertical, horizontal, latest = (np.array(x, np.float64) for x in old[:3])
     known = np.array(old.known)

@@ -24,7 +24,7 @@ RESEARCH = "draws manifests diversity reference headroom proof"
 
 
 def find_command(verb: Verb) -> click.Command:
-    """Find the click command of a verb in the program's groups of commands."""
+    """Return the click command that the program registers for a verb."""
     command: click.Command | None = cli
     for word in verb.name.split():
         assert isinstance(command, VerbGroup)

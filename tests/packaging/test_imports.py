@@ -1,4 +1,4 @@
-"""Test the order of imports between packages and folders, and the libraries that the reader imports."""
+"""Test which packages and folders may import which others, and which libraries the reader imports."""
 
 from __future__ import annotations
 

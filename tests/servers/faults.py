@@ -57,14 +57,14 @@ class Slow:
 
 @dataclass(frozen=True)
 class Short:
-    """Send `by` bytes less than requested, with a Content-Length that agrees with the body."""
+    """Send `by` bytes less than requested, with a matching Content-Length."""
 
     by: int = 1
 
 
 @dataclass(frozen=True)
 class Long:
-    """Send `by` bytes more than requested (zeros past the file's end), with a Content-Length that agrees."""
+    """Send `by` bytes more than requested, with a matching Content-Length; bytes past the file's end are zeros."""
 
     by: int = 1
 

@@ -402,7 +402,7 @@ def evaluate_controls(
             a task has no partner.
     """
     rules = protocol if isinstance(protocol, Protocol) else get_protocol(protocol)
-    plan_tasks(tasks, rules, "swapped")  # a task without a partner is an error before hours of work
+    plan_tasks(tasks, rules, "swapped")  # reports a task without a partner now, not after hours
     # Only equal functions share compiled programs, and some `make_ego` return new functions in each call.
     make = make_ego if make_ego in SCRIPTED else cache(make_ego)
     options["programs"] = Programs() if programs is None else programs

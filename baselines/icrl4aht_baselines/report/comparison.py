@@ -358,10 +358,11 @@ def describe_trainings() -> str:
         return ""
     steps, width = _span([one.steps for one in trained], ",d"), _span([one.width for one in trained], "d")
     better = sum(not one.agent.startswith("best response") for one in behaviours)
+    runs = _span([len(one.seeds) for one in behaviours], "d")
     return (
-        f"Best responses exist for {len(behaviours)} behaviours. Trainings with each behaviour: "
-        f"{_span([len(one.seeds) for one in behaviours], 'd')}, of {steps} steps and width {width}. With {better} of "
-        f"these behaviours a stored model earns more, and B is its return."
+        f"Each of {len(behaviours)} behaviours has a best response from {runs} training "
+        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. For {better} behaviours a stored "
+        f"model earns more, and its return counts instead."
     )
 
 

@@ -403,9 +403,10 @@ def find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: s
 
 
 def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
-    """Merge the runs of an agent on different result cells, such as those of one model per layout, into one run.
+    """Merge runs of one agent under one protocol that cover disjoint result cells, such as those of a model per layout.
 
-    Runs with the same result cell, or with other rules or seeds, are not merged. Such a run gets its folder as `note`.
+    Runs that overlap, or differ in rules, seeds, play mode or encoder, stay separate; later ones get their folder as
+    `note`.
     """
     merged: list[EvaluationRun] = []
     for run in runs:

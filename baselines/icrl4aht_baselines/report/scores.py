@@ -321,8 +321,10 @@ def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str
             texts.append(ratio_interval([[stratum] for stratum in strata]).text(sign="+"))
         memory, partner = texts
         lines += [
-            f"track {track}, memory M: {memory}, return minus return with the memory cleared before each episode",
-            f"track {track}, partner P: {partner}, return in the {last} minus return in them after another teammate",
+            f"track {track}, benefit M of memory: {memory}, the return minus the return with memory cleared "
+            "before each episode",
+            f"track {track}, benefit P of the right context: {partner}, the return in the {last} minus the return "
+            "in them after episodes with another teammate",
         ]
     return lines
 

@@ -351,8 +351,7 @@ def _plate_subgoals(view: OracleView) -> list[Subgoal]:
     holds, building = view.scene.holds_plate, jnp.min(view.plan_costs) < NEVER
     right = view.right & ~view.teammate_pots
     soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
-    # The ego has to wait for a soup that is not done on its arrival. Each step of waiting costs as much as a step of
-    # walking.
+    # If a soup is not done when the ego arrives, the ego waits. Each step of waiting costs as much as walking a step.
     rest = jnp.maximum(view.timers - view.pot_times, 0)
     return [
         # Plate the soup of the current recipe.

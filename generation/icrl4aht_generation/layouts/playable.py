@@ -63,7 +63,7 @@ def _can_deliver(
     own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
     # Computing `LayoutFacts` takes longer than an episode, so all tries of a batch share the result.
-    egos = oracle_params(own), oracle_params([_ExchangedLayout(*astuple(layout)) for layout in own])
+    egos = oracle_params(own), oracle_params([_SwappedStartsLayout(*astuple(layout)) for layout in own])
     starts = np.array([layout.agent_cells for layout in own], np.uint8)
     earned = np.zeros(len(own), bool)
     for hundreds, playing, at_starts in tries:
@@ -111,8 +111,8 @@ def _play(tables: Tables, egos: tuple[Any, Any], playing: Any, carry: RolloutCar
     return carry, played.reward.max(axis=0)
 
 
-class _ExchangedLayout(Layout):
-    """Layout with exchanged start cells of the agents, for a policy that can only play the ego."""
+class _SwappedStartsLayout(Layout):
+    """Layout with the agents' start cells swapped, for a policy that can only play the ego."""
 
     @cached_property
     def agent_cells(self) -> tuple[int, ...]:

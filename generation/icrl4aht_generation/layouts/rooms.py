@@ -65,7 +65,10 @@ def _crop(floor: np.ndarray) -> np.ndarray:
 
 
 def _two_rooms(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return two rooms, each perhaps without a corner, separated by a line of counters that may have a step."""
+    """Return two rooms, separated by a line of counters that is straight or bends once by one cell.
+
+    Each room may have a rectangle cut from a corner.
+    """
     upright = bool(rng.integers(2))
     rows, columns = (MOST_ROWS, MOST_COLUMNS) if upright else (MOST_COLUMNS, MOST_ROWS)
     while True:

@@ -190,7 +190,9 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
         learners=tasks.learners,
         presets=_check_distinct("tasks.presets", tasks.presets),
         sampled=_sampled_config(tasks.sampled, layouts, sources) if tasks.sampled else None,
-        spread=SpreadConfig(**_numbers("tasks.spread", tasks.spread, layouts, sources)) if tasks.spread else None,
+        spread=SpreadConfig(**_teammate_counts("tasks.spread", tasks.spread, layouts, sources))
+        if tasks.spread
+        else None,
         algorithms={each: tuple(algorithms[each]) for each in layouts if algorithms.get(each)},
         xla_threads=content.xla_threads,
         **msgspec.structs.asdict(release),
@@ -207,7 +209,7 @@ def _read_section(
 
 
 def _sampled_config(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
-    counts = _numbers("tasks.sampled", values, layouts, sources)
+    counts = _teammate_counts("tasks.sampled", values, layouts, sources)
     chosen: dict[str, Any] = _by_layout("tasks.sampled.families", values.families, layouts)
     families = {name: _check_distinct("tasks.sampled.families", chosen.get(name, ())) for name in layouts}
     for name in layouts:
@@ -217,7 +219,7 @@ def _sampled_config(values: _Sampled, layouts: tuple[str, ...], sources: tuple[s
     return SampledConfig(**counts, families=families)
 
 
-def _numbers(
+def _teammate_counts(
     section: str, values: _Spread, layouts: tuple[str, ...], sources: tuple[str, ...]
 ) -> dict[str, dict[str, int]]:
     """Return the numbers of sampled teammates by field of `SpreadConfig` and by layout."""

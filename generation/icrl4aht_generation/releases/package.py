@@ -62,22 +62,22 @@ class TaskHistories(NamedTuple):
     least_improvement: float | None
 
     @property
-    def recorded(self) -> np.ndarray:
+    def recorded_returns(self) -> np.ndarray:
         """Episode returns of all streams of all learners, float64 (N, E)."""
         return np.concatenate(self.returns)
 
     @property
-    def kept(self) -> np.ndarray:
+    def kept_returns(self) -> np.ndarray:
         """Episode returns of the selected streams, float64 (n, E)."""
         return np.concatenate([own[streams] for own, streams in zip(self.returns, self.streams, strict=True)])
 
     def left_out(self, reason: str) -> LeftOutTask:
         """Return a record of the task for the release's list of left-out tasks."""
-        start, end = (round(float(ends.mean()), 3) for ends in curve_ends(self.recorded))
+        start, end = (round(float(ends.mean()), 3) for ends in curve_ends(self.recorded_returns))
         learners = len(self.folders) if self.source == "ppo" else 0
         layout, name = self.task.layout.name, teammate_name(self.task)
         return LeftOutTask(
-            self.task.task_id, layout, name, self.source, learners, len(self.recorded), start, end, reason
+            self.task.task_id, layout, name, self.source, learners, len(self.recorded_returns), start, end, reason
         )
 
 
@@ -111,9 +111,9 @@ def select_histories(
             f"the ego does not matter: returns of these egos differ by less than {LEAST_HEADROOM:g}: "
             f"{facts.references.describe()}"
         )
-    if not len(found.kept):
+    if not len(found.kept_returns):
         return found.left_out(f"the learners did not learn: no stream's end exceeds its start by {least or 0:g}")
-    start, end = curve_ends(found.kept)
+    start, end = curve_ends(found.kept_returns)
     if headroom and profile.least_rise is not None and end.mean() - start.mean() < profile.least_rise:
         return found.left_out(
             f"its histories rise by {end.mean() - start.mean():.1f} on average, expected {profile.least_rise:g}"
@@ -165,7 +165,7 @@ def package_release(
             written(1)
         else:
             new.append(_new_task(found, profile, suite, facts[task_id], recorded))
-            for returns in found.kept:
+            for returns in found.kept_returns:
                 add_curve(curves, found.source, layout_title(task.layout.name), task.split, returns)
         chosen(1)
     if not new:
@@ -243,7 +243,7 @@ def _new_task(
         labeller, expert = choose_labeller(found.folders, task, suite)
         files |= expert_files(labeller, str(expert.policy_sha256)) if profile.policies else {}
         own = {"ego": metadata["ego"], "ego_hash": metadata["ego_hash"], "learners": len(found.folders)}
-        own["filter"] = filter_report(found.recorded, found.kept, found.least_improvement)
+        own["filter"] = filter_report(found.recorded_returns, found.kept_returns, found.least_improvement)
     made = Provenance(
         profile=profile.name,
         profile_hash=profile.hash,
@@ -253,14 +253,14 @@ def _new_task(
         references=facts.references,
         nearest_test=facts.nearest,
         teammate={"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
-        streams_recorded=len(found.recorded),
-        streams_kept=len(found.kept),
+        streams_recorded=len(found.recorded_returns),
+        streams_kept=len(found.kept_returns),
         suite=_populations(task, profile, suite, recorded) if task.teammate_family == "rl" else None,
         expert=expert,
         **own,
     )
     # Store the oracle's actions if they are worth learning, or if the oracle also gives the labels.
-    with_oracle = profile.oracle_actions and made.is_oracle_useful(float(curve_ends(found.kept)[1].mean()))
+    with_oracle = profile.oracle_actions and made.is_oracle_useful(float(curve_ends(found.kept_returns)[1].mean()))
 
     def load() -> Iterator[NewHistory]:
         label = _labels(found, labeller)
@@ -272,7 +272,7 @@ def _new_task(
                 labels["oracle_actions"] = oracle_labels(task.layout, arrays["state"], arrays["actions"])
             yield NewHistory(stream, arrays | labels, learner)
 
-    return NewTask(task, made, len(found.kept), load, files)
+    return NewTask(task, made, len(found.kept_returns), load, files)
 
 
 def _script_labels(source: str, references: ReferenceEgos) -> ExpertLabels:

@@ -1,4 +1,4 @@
-"""Bundled models: copied from training runs, loaded by name and listed by the command `models`."""
+"""Test bundled models, which are copied from training runs, loaded by name and listed by the command `models`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The positive control of in-context learning: small environments, learning algorithms and checks."""
+"""Test the positive control of in-context learning: its small environments, learning algorithms and checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Evaluation of trained models."""
+"""Test the evaluation of trained models."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models trained with canonical channels on several layouts, and evaluated on a layout with other channels."""
+"""Test models that are trained with canonical channels, and evaluated on a layout with other channels."""
 
 from __future__ import annotations
 

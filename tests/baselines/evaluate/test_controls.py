@@ -1,4 +1,4 @@
-"""Memory and partner controls and the protocol `swap`, tested with an ego whose actions depend on its memory."""
+"""Test memory and partner controls and the protocol `swap`, with an ego whose actions depend on its memory."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _act(mode, memory, ego_input, key):
 
 
 def ego(mode):
-    """Return an ego that stays, acts randomly, or (PAID) does so only after a first episode without reward."""
+    """Return an ego that stays, acts randomly, or, for `PAID`, acts randomly after a first episode without reward."""
     policy = Policy(jnp.int32(mode), _begin, _act, "ego_input")
     return lambda layout: policy
 
@@ -94,8 +94,11 @@ def test_memory_and_partner_controls_equal_hand_computed_differences(solo_return
     assert found.memory[0, 0] < 0 and found.memory[1, 0] == 0
     assert found.partner[0, 0] < 0 < found.partner[1, 0]
     memory, partner = control_lines(found, TASKS)
-    assert f"track teammate, memory M: {found.memory.mean():+.1f}, " in memory
-    assert f"track teammate, partner P: {found.partner.mean():+.1f}, return in the 2 last episodes" in partner
+    assert f"track teammate, benefit M of memory: {found.memory.mean():+.1f}, " in memory
+    assert (
+        f"track teammate, benefit P of the right context: {found.partner.mean():+.1f}, the return in the 2 last"
+        in partner
+    )
 
 
 def test_control_intervals_treat_equal_behaviours_as_one_unit():
@@ -109,7 +112,7 @@ def test_control_intervals_treat_equal_behaviours_as_one_unit():
             for value, scale in ((values, 1.0), (values, 0.0))
         )
         memory, _ = control_lines(ControlledResults(plain, zero, zero, 2), own)
-        assert memory.startswith("track teammate, memory M: +2.0") and ("(" in memory) == (family == "H3")
+        assert memory.startswith("track teammate, benefit M of memory: +2.0") and ("(" in memory) == (family == "H3")
 
 
 def test_controls_do_not_change_returns_of_ego_without_memory(solo_returns, programs):
@@ -255,7 +258,10 @@ def test_evaluate_command_with_controls_writes_all_results(programs, tmp_path, m
         return run_cli(*command, "--out", tmp_path / folder, code=code)
 
     printed = run("run", "--episodes", "4", "--controls")
-    assert "track teammate, memory M: " in printed and "track teammate, partner P: " in printed
+    assert (
+        "track teammate, benefit M of memory: " in printed
+        and "track teammate, benefit P of the right context: " in printed
+    )
     for folder in ("run", "run/cleared", "run/swapped"):
         assert len(list((tmp_path / folder / "tasks").glob("*.json"))) == 2
     assert "--controls: cannot be used with --forget" in run("run", "--controls", "--forget", code=2)

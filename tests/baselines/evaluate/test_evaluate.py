@@ -1,4 +1,4 @@
-"""The evaluator: results that depend only on the task, inputs of egos, stored results and error messages."""
+"""Test the evaluator: results depend only on the task, egos get the right inputs, and errors are clear."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands `train`, `evaluate` and `report`, with learned teammates that a suite holds out of training."""
+"""Test `train`, `evaluate` and `report` with learned teammates that a suite holds out of training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The encoders `words` and `mlp` give equal results on state records and on observations."""
+"""Test that the encoders `words` and `mlp` give equal results on state records and on observations."""
 
 from __future__ import annotations
 

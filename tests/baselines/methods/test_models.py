@@ -1,4 +1,4 @@
-"""The models: parameter counts, causality, and equal outputs in training and in cached and exact acting."""
+"""Test models: parameter counts, causality, and equal outputs in training and in cached and exact acting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Changed views of an ego: mirrored layouts and hidden recipe indicators."""
+"""Test changed views of an ego: mirrored layouts and hidden recipe indicators."""
 
 from __future__ import annotations
 

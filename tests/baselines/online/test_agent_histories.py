@@ -1,4 +1,4 @@
-"""Histories recorded from trained agents: labels, teammates, resumed collection and the release."""
+"""Test histories recorded from trained agents: labels, teammates, resumed collection and the release."""
 
 from __future__ import annotations
 

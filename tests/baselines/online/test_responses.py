@@ -1,4 +1,4 @@
-"""Best responses and adaptation headroom: groups of tasks, choice of training runs, tables and tiny training runs."""
+"""Test best responses and adaptation headroom: groups of tasks, choice of training runs, tables and tiny jobs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""RL^2: model outputs, training episodes, resumed training, and the choice of teammates and layouts."""
+"""Test RL^2: model outputs, training episodes, resumed training, and the choice of teammates and layouts."""
 
 from __future__ import annotations
 

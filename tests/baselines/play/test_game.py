@@ -1,4 +1,4 @@
-"""Games of people and policies: returns equal to an evaluation's, partners found by name, and egos in either slot."""
+"""Test games of people and policies: returns equal an evaluation's, and egos can play in either slot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of the command `play` in headless Chromium: keys, touch, a lost connection, and the recorded history."""
+"""Test the page of the command `play` in headless Chromium: keys, touch, a lost connection, and recording."""
 
 from __future__ import annotations
 

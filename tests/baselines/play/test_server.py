@@ -1,4 +1,4 @@
-"""The websocket of a game, tested without a browser: keys, records, lost connections and invalid input."""
+"""Test a game's websocket without a browser: keys, records, lost connections and invalid input."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_keys_move_the_agent_by_the_rules():
 
 
 def play_by_oracle(player: Browser, episodes: int, steps: int) -> None:
-    """Play episodes with the oracle's actions in place of a person's keys."""
+    """Play episodes with the oracle's actions instead of a person's keys."""
     plan = PolicyPlayer(oracle(LAYOUT), LAYOUT, EGO, is_ego=True)
     key, before = task_key(0, "plan"), (None,) * 5
     for episode in range(episodes):

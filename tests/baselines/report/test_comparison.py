@@ -1,4 +1,4 @@
-"""The page docs/results.md: stored results, tables computed from invented returns, and the committed page."""
+"""Test the page docs/results.md: stored results, tables computed from invented returns, and the committed page."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def row(table: str, agent: str) -> list[str]:
     return [cell.strip() for cell in line.strip("|").split(" | ")]
 
 
-def test_stored_results_have_blocks_and_curves_and_can_be_read_again(stored, tmp_path):
+def test_stored_results_have_episode_blocks_and_curves_and_can_be_read_again(stored, tmp_path):
     assert len(stored.table) == 4 * 40 * 3 * 6 and len(stored.curves) == 4 * 2 * 100
     curve = stored.curves[(stored.curves["agent"] == "high") & (stored.curves["control"] == "")]
     assert curve["return"].tolist() == [value + 2.0 for value in HIGH] * 2, "mean over the five teammates"
@@ -78,7 +78,7 @@ def test_lead_is_the_difference_of_the_two_highest_scores(tmp_path, invented_res
     assert "differ by +0.20 (+0.20 to +0.20): `b` minus `c`" in lead
 
 
-def test_controls_table_has_memory_and_partner_controls_and_blocks(stored, invented_responses):
+def test_controls_table_has_memory_and_partner_controls_and_episode_blocks(stored, invented_responses):
     table = comparison.controls_table(stored, stored.returns(), cell_scales("seeded"))
     high, low = row(table, "high"), row(table, "low")
     assert high[1].startswith("**+15.5 (") and high[1].endswith(")**"), "19.5 + 2 - (5 + 1)"

@@ -1,4 +1,4 @@
-"""The HTML report in headless Chromium at the width of a phone."""
+"""Test the HTML report in headless Chromium at the width of a phone."""
 
 from __future__ import annotations
 

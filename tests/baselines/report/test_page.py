@@ -1,4 +1,4 @@
-"""The HTML report, the Markdown report and cards: complete content, no external files, escaped names."""
+"""Test the HTML report, the Markdown report and cards: complete content, no external files, escaped names."""
 
 from __future__ import annotations
 

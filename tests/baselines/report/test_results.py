@@ -1,4 +1,4 @@
-"""The table of results: kinds of tasks, blocks of episodes, overlap with training data, and merged runs."""
+"""Test the table of results: kinds of tasks, blocks of episodes, overlap with training data, and merged runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scores relative to best responses, tables, summaries and the paper's numbers, compared with known values."""
+"""Test scores relative to best responses, tables, summaries and the paper's numbers against known values."""
 
 from __future__ import annotations
 

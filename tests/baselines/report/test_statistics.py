@@ -1,4 +1,4 @@
-"""Confidence intervals and p-values compared with known numbers, and the coverage of intervals in simulations."""
+"""Test confidence intervals and p-values against known numbers, and the coverage of intervals by simulation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Submissions: files made from results of `evaluate`, refused if incomplete or not comparable."""
+"""Test submissions: files are made from results of `evaluate`, and refused if incomplete or not comparable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Loggers of training runs, tested with the real logging libraries in their offline modes."""
+"""Test loggers of training runs with the real logging libraries in their offline modes."""
 
 from __future__ import annotations
 

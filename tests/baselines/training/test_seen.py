@@ -1,4 +1,4 @@
-"""The record of layouts and teammates in a model's training data."""
+"""Test the record of layouts and teammates in a model's training data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The trainer: training steps, exact resumption, several devices and processes, held-out data, run folders."""
+"""Test the trainer: steps, exact resumption, several devices and processes, held-out data, run folders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tasks as Gymnasium environments: Gymnasium's checker, registered ids, and replays of recorded histories."""
+"""Test tasks as Gymnasium environments: Gymnasium's checker, registered ids, and replays of histories."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The environment with JaxMARL's interface: base class, log wrapper, and equality with our environment."""
+"""Test the environment with JaxMARL's interface: base class, log wrapper, and equality with our environment."""
 
 from __future__ import annotations
 

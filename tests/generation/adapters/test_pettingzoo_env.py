@@ -1,4 +1,4 @@
-"""The PettingZoo environment of both agents: PettingZoo's checks, and replays of recorded histories."""
+"""Test the PettingZoo environment of both agents: PettingZoo's checks, and replays of recorded histories."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Collection of one task: killed and resumed runs write the same artefact; full disks give clear errors."""
+"""Test collecting one task: killed and resumed runs write the same artefact; full disks give clear errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recording of roll-outs, selection of the streams of a release, and labels of recorded steps."""
+"""Test recording of roll-outs, selection of the streams of a release, and labels of recorded steps."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_recorded_arrays_equal_those_of_a_loop_over_steps(length, updates):
     rollouts = [random_rollout(length, rng) for _ in range(updates)]
     expected = record_by_loop(rollouts, config)
     found = empty_histories(config)
-    for number in (*reversed(range(updates)), *range(updates)):  # in any order, and twice
+    for number in (*reversed(range(updates)), *range(updates)):  # roll-outs may be recorded in any order, and again
         record_rollout(found, number, rollouts[number])
     for name, array in expected._asdict().items():
         assert array.size and not (array == UNTOUCHED).any(), name  # every entry was written

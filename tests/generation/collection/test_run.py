@@ -1,4 +1,4 @@
-"""Collection of all tasks of a rebuild: unfinished tasks, two processes at once, and workers on Ray."""
+"""Test collecting all tasks of a rebuild: unfinished tasks, two processes at once, and workers on Ray."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Histories played by scripted egos: actions, noise, labels, and results that do not depend on the batch size."""
+"""Test histories played by scripted egos: actions, noise, labels, and independence from the batch size."""
 
 from __future__ import annotations
 

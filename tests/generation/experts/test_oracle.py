@@ -1,4 +1,4 @@
-"""The scripted oracle ego: it makes no wrong deliveries and earns more than H4 in the ego's slot."""
+"""Test the scripted oracle ego: it makes no wrong deliveries and earns more than H4 in the ego's slot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=2)
 TASKS = [task for track in TRACKS for task in published_tasks(track)]
 
 FAMILY_ON = {
-    # One family for each layout; together the teammates cook, block, only deliver, or wander.
+    # One family for each layout. The tests cover teammates that cook, block the ego, only deliver, or wander.
     "coord_simple": "H4",
     "coord_ring": "H2",
     "test_simple": "H3",

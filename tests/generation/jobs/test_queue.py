@@ -1,4 +1,4 @@
-"""The job queue: local processes, failures, retries, and jobs that other processes run."""
+"""Test the job queue: local processes, failures, retries, and jobs that other processes run."""
 
 from __future__ import annotations
 

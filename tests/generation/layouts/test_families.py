@@ -1,4 +1,4 @@
-"""Generated layouts: determined by family, seed and number, distinct up to symmetry, and split disjointly."""
+"""Test generated layouts: family, seed and number determine them, and no two are symmetric or in two splits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rearranged versions of layouts, on which stored models were trained."""
+"""Test the rearranged versions of layouts on which stored models were trained."""
 
 from __future__ import annotations
 

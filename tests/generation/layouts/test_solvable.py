@@ -1,4 +1,4 @@
-"""The check that all recipes of a layout can be cooked and delivered."""
+"""Test the check that all recipes of a layout can be cooked and delivered."""
 
 from __future__ import annotations
 

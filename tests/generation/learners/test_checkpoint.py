@@ -1,4 +1,4 @@
-"""Checkpoints of policies: parameters are restored exactly, and rows of zeros take no space."""
+"""Test checkpoints of policies: parameters are restored exactly, and rows of zeros take no space."""
 
 import json
 

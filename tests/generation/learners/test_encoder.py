@@ -1,4 +1,4 @@
-"""Encoders give the same results for observations and for the compact forms of observations."""
+"""Test that encoders give the same results for observations and for their compact forms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The network gives the outputs and gradients of a reference network made of Flax's layers."""
+"""Test that the network has the outputs and gradients of a reference network made of Flax's layers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One update of a population: training data of each policy, changes of the state, and metrics."""
+"""Test one update of a population: training data of each policy, changes of the state, and metrics."""
 
 from __future__ import annotations
 

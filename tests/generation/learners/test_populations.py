@@ -1,4 +1,4 @@
-"""The population algorithms: which policies play which agent slots, weights of slots, and LBRDiv's multipliers.
+"""Test the population algorithms: policies of agent slots, weights of slots, and LBRDiv's multipliers.
 
 Expected values are computed by the formulas of the paper's App. B.1.
 """

@@ -1,4 +1,4 @@
-"""PPO: advantages, loss, replay of the recurrent state, schedules, and learning.
+"""Test PPO: advantages, loss, replay of the recurrent state, schedules, and learning.
 
 All tests use one tiny learner. Its ego stands between two buttons, a pile and a pot, so it often presses a button
 (reward -5) or fills the pot (shaped reward 3). Roll-outs have 8 steps and episodes 12, so of three roll-outs, one

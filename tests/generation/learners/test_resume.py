@@ -1,4 +1,4 @@
-"""Saved states, logs and folder locks of training runs."""
+"""Test saved states, logs and folder locks of training runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Roll-outs: agent slots, observations of each player, memories that restart with each episode, and a restart hook.
+"""Test roll-outs: agent slots, observations, memories that restart with each episode, and a restart hook.
 
 Four environments have episodes of five steps. Two scripted players share the eight slots in mixed order; each
 remembers the state record at the start of the episode and the number of steps since.
@@ -218,7 +218,7 @@ def test_players_start_with_the_state_after_the_restart_hook(played_with_hook):
 
 @pytest.mark.parametrize("greedy", [True, False])
 def test_network_player_gives_the_outputs_of_its_network(params, apply, greedy):
-    """Compare log-probabilities, values, greedy actions and next hidden states, from a nonzero hidden state."""
+    """Compare the player's choices and next hidden states with a call of the network, from a nonzero hidden state."""
     slots, partner = np.array([6, 1, 3, 4]), jnp.array([2, 0, 1, 1])
     own = policy_params(params, 1)
     player = network_player(ENV, NETWORK, own, slots, partner, greedy)

@@ -1,4 +1,4 @@
-"""The command `icrl4aht-data plan`, which estimates the cost of generating a release."""
+"""Test the command `icrl4aht-data plan`, which estimates the cost of generating a release."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Populations on disk: checkpoints and cards, interrupted runs, selection of teammates, and manifests.
+"""Test populations on disk: checkpoints and cards, interrupted runs, selection of teammates, and manifests.
 
 Each algorithm is trained at most once, with the shipped profile `smoke` and one epoch: two members and six updates of
 2,048 steps. Tests that are not marked slow train only LBRDiv.

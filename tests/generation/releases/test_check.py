@@ -1,4 +1,4 @@
-"""The command `icrl4aht-data check A B`, which compares two rebuilds."""
+"""Test the command `icrl4aht-data check A B`, which compares two rebuilds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Generate releases from tiny profiles: collected tasks, packaged releases, learned teammates and invalid folders."""
+"""Test releases from tiny profiles: collected tasks, packaging, learned teammates and invalid folders."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def quick_measurements():
 
 @pytest.fixture(scope="module")
 def learned_rebuild(tmp_path_factory) -> Path:
-    """Return a rebuild with learned teammates, selected without a threshold for returns. Read only."""
+    """Return a rebuild with learned teammates, selected without a threshold for returns (read-only)."""
     profile = tmp_path_factory.mktemp("learned") / "learned.toml"
     out = profile.parent / "out"
     profile.write_text(LEARNED)

@@ -1,4 +1,4 @@
-"""The checkpoint that labels a task's histories: measured returns, the choice, and records in the release."""
+"""Test the checkpoint that labels a task's histories: measured returns, the choice, and stored records."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from tests.helpers.tiny import artefact
 
 
 def returns_with_means(*means: float, spread: float = 0.0) -> np.ndarray:
-    """Return returns (C, E) with the given means; `spread` is the standard deviation of differences of checkpoints."""
+    """Make episode returns (C, E) of C checkpoints with the given means, whose differences deviate by `spread`."""
     noise = np.random.default_rng(0).normal(size=(len(means), LABEL_EPISODES)) * spread / np.sqrt(2)
     return np.array(means)[:, None] + noise - noise.mean(axis=1, keepdims=True)
 

@@ -1,4 +1,4 @@
-"""Packaging a release: selected streams, noise histories, labels, omitted tasks, and measurements of teammates."""
+"""Test packaging a release: selected streams, noise histories, labels, omitted tasks, and measured teammates."""
 
 from __future__ import annotations
 

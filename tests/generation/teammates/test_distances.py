@@ -1,4 +1,4 @@
-"""Distances of teammates to the test teammates, groups of equal behaviour, and returns of reference egos."""
+"""Test distances of teammates to test teammates, groups of equal behaviour, and returns of reference egos."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_distance_is_measured_on_states_of_the_test_teammates_family():
 
 
 def test_teammates_are_grouped_into_numbered_behaviours():
-    """Teammates that differ in 1 of 100 states count as one behaviour, in 2 of 100 as two."""
+    """Teammates that differ in 1 of 100 states count as one behaviour; those that differ in 2 count as two."""
     actions = np.zeros((5, 10, 10), np.int8)
     actions[1, 0, :2] = 1
     actions[2, 0, 0] = 1

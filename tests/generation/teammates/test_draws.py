@@ -1,4 +1,4 @@
-"""Teammates with drawn parameters: the shipped table of measured draws, and the choice of draws for tasks."""
+"""Test teammates with drawn parameters: the shipped table of measured draws, and the choice for tasks."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The heuristic teammates: published actions and mean returns, every family on every layout as either agent, rules
-that published play does not reach, and random numbers."""
+"""Test the heuristic teammates: published actions and mean returns, every family on every layout as either agent,
+rules that published play does not reach, and random numbers."""
 
 from __future__ import annotations
 
@@ -408,8 +408,8 @@ def greedy_memory(intent: int = -1, wait: int = 0) -> GreedyMemory:
     return GreedyMemory(key, jnp.full(ROWS, intent, jnp.int32), jnp.full(ROWS, wait, jnp.int32))
 
 
-def move_h4_up(slot: int, partner: tuple[int, int, str], memory: GreedyMemory) -> tuple[np.ndarray, GreedyMemory]:
-    """Return actions and memories of H4 with empty hands at (1, 2), which wants to move up, towards pile 0."""
+def move_greedy_up(slot: int, partner: tuple[int, int, str], memory: GreedyMemory) -> tuple[np.ndarray, GreedyMemory]:
+    """Return actions and memories of `utility_greedy` at (1, 2), which has empty hands and wants to go up to pile 0."""
     layout, mover = LAYOUTS["cramped_up"], (1, 2, "up")
     record = state_record(layout, *((mover, partner) if slot == 0 else (partner, mover)))
     memories = first_memories() | {(H4, slot): memory}
@@ -417,20 +417,20 @@ def move_h4_up(slot: int, partner: tuple[int, int, str], memory: GreedyMemory) -
 
 
 @pytest.mark.parametrize("slot", [0, 1])
-def test_h4_yields_only_if_its_next_cell_is_adjacent_to_the_partner(slot):
-    actions, after = move_h4_up(slot, (2, 1, "down"), greedy_memory())
+def test_utility_greedy_yields_only_if_its_next_cell_is_adjacent_to_the_partner(slot):
+    actions, after = move_greedy_up(slot, (2, 1, "down"), greedy_memory())
     yields = (20, 40)[slot] > ROLLS
     np.testing.assert_array_equal(actions, np.where(yields, STAY, UP))
     np.testing.assert_array_equal(after.wait, np.where(yields, 1 + ROLLS % 2, 0))
     assert (after.intent == utility_greedy.FETCH).all()
-    actions, after = move_h4_up(slot, (3, 2, "down"), greedy_memory())
+    actions, after = move_greedy_up(slot, (3, 2, "down"), greedy_memory())
     assert (actions == UP).all() and (after.wait == 0).all()
 
 
-def test_waiting_h4_keeps_its_intent_and_advances_its_random_key():
+def test_waiting_utility_greedy_keeps_its_intent_and_advances_its_random_key():
     memory = greedy_memory(utility_greedy.PRESS, wait=2)
     for wait in (1, 0):
         following = jax.vmap(lambda key: jax.random.split(key, 3)[0])(memory.key)
-        actions, memory = move_h4_up(1, (2, 1, "down"), memory)
+        actions, memory = move_greedy_up(1, (2, 1, "down"), memory)
         assert (actions == STAY).all() and (memory.wait == wait).all()
         assert (memory.intent == utility_greedy.PRESS).all() and (memory.key == following).all()

@@ -1,4 +1,4 @@
-"""Learned teammates from checkpoints: greedy or sampled actions, memory, both agent slots, and errors."""
+"""Test learned teammates from checkpoints: greedy or sampled actions, memory, both agent slots, and errors."""
 
 from __future__ import annotations
 

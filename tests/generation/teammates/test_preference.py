@@ -1,4 +1,4 @@
-"""Tasks of the track preference: disjoint splits, and layouts that hide the recipe."""
+"""Test tasks of the track preference: disjoint splits, and layouts that hide the recipe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The registry of heuristic teammates: parameters, presets, and sampled teammates of each split."""
+"""Test the registry of heuristic teammates: parameters, presets, and sampled teammates of each split."""
 
 from __future__ import annotations
 

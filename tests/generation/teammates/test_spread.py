@@ -1,4 +1,4 @@
-"""Spread teammates, which behave very differently: the choice, the shipped list, and added random actions."""
+"""Test spread teammates, which behave very differently: the choice, the shipped list, and random actions."""
 
 from __future__ import annotations
 

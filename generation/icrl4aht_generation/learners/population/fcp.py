@@ -27,7 +27,7 @@ class FCP(Algorithm):
     def assignment(self, environments: int) -> Assignment:
         """Return the assignment, with one term for each member: the member's self-play return."""
         member = np.repeat(np.arange(self.members), environments)
-        # The slots of both agents are samples of the same return, and the policy learns from both.
+        # A member plays both slots. Both are samples of its self-play return, and it learns from both.
         both = np.stack([member, member])
         return Assignment(both, both, np.arange(self.members), self.members, np.full(member.size, -1))
 

@@ -89,7 +89,8 @@ def _intent_values(scene: Scene, params, waits, needed_reachable) -> tuple[Float
         jnp.where(can_add, 1 + 0.2 * nonfull, 0.8),
         jnp.where(can_add, 0.4 + 0.05 * nonfull, 0.15),
     )
-    # As in the published code, the bonus of adding depends on the fullest pot, not on the nearest pot.
+    # As in the published code, the value of adding an ingredient rises with the free space in the fullest pot, not in
+    # the nearest pot.
     fullest = jnp.max(ingredient_count(scene.state.pot_items)).astype(jnp.int32)
     finished = 1 + 0.5 * cooked
     no_pot_in_use = cooking + cooked + nonfull == 0
