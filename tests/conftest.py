@@ -37,10 +37,13 @@ COMPILATION_CACHE: dict[str, Any] = {
     "jax_persistent_cache_min_compile_time_secs": 0.1,  # warm runs take a third less CPU time than with 0.5
 }
 COSTLIEST = """
-collect notebooks wheel reference generate run heuristics scripted suite fetch gymnasium_env rl2 docs models trainer
+collect notebooks wheel reference heuristics scripted rl2 suite generate run fetch gymnasium_env docs models trainer
 rollout ppo population_updates oracle hostile faults responses commands controls
 """
-"""Test files that take longest, in the order to run them; `test_collect.py` generates releases that others read."""
+"""Test files that take longest, in the order to run them.
+
+`test_collect.py` generates releases that others wait for, such as `test_generate.py`, which therefore comes later.
+"""
 QUICK_COMPILATION = (
     "--xla_cpu_use_fusion_emitters=false"  # XLA's older code generator compiles faster if optimizations are off
 )
