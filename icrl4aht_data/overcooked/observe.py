@@ -18,12 +18,21 @@ Cells outside the map are zero in all channels. All values are integers in 0..19
 from __future__ import annotations
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.overcooked.cells import CENTRE, NOWHERE, VISIBLE, WINDOW
+from icrl4aht_data.overcooked.cells import NOWHERE, WINDOW
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, channel_names
 from icrl4aht_data.overcooked.layouts import Layout, tables_of
 from icrl4aht_data.overcooked.rules import look_up
 from icrl4aht_data.overcooked.state import State, unpack
-from icrl4aht_data.overcooked.tables import AGENT_BITS, DELIVERY_BIT, FIXED_BIT, RECIPE_BIT, TIMER_BIT, Array, Tables
+from icrl4aht_data.overcooked.tables import (
+    AGENT_BITS,
+    CELL_BIT,
+    DELIVERY_BIT,
+    FIXED_BIT,
+    RECIPE_BIT,
+    TIMER_BIT,
+    Array,
+    Tables,
+)
 
 
 def observe(layout: Layout | Tables, record: Array, agent: int, canonical: bool = False) -> Array:
@@ -82,15 +91,10 @@ def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
 
     bodies = 1 | xp.astype(1 << (xp.astype(state.facings, xp.uint32) + 1), xp.uint32)
     bodies = bodies | xp.astype(state.hands, xp.uint32) << 5
-    right, down = (look_up(axis, other) - look_up(axis, me) for axis in (tables.column, tables.row))
-    reach = WINDOW // 2
-    seen = (xp.abs(right) <= reach) & (xp.abs(down) <= reach)
-    # The observer is always in the centre. An agent out of view gets position NOWHERE, which matches no visible cell.
-    relative = xp.where(seen, CENTRE + right + WINDOW * down, NOWHERE)
-    position = xp.arange(VISIBLE, dtype=xp.int32)
-    none = xp.zeros_like(cells)
-    agents = xp.where(position == CENTRE, bodies[..., agent, None], none) | xp.where(
-        position == relative[..., None], bodies[..., 1 - agent, None] << AGENT_BITS, none
+    # The agents are in different cells, and no agent has the number NOWHERE of cells outside the map.
+    cell, none = view >> CELL_BIT, xp.zeros_like(cells)
+    agents = xp.where(cell == me[..., None], bodies[..., agent, None], none) | xp.where(
+        cell == other[..., None], bodies[..., 1 - agent, None] << AGENT_BITS, none
     )
     return agents, cells
 

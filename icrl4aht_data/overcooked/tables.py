@@ -43,7 +43,7 @@ SEARCH_ORDER = (RIGHT, DOWN, LEFT, UP)
 # Bits of the first word, the cell: item 0..7, pot timer 8..12, recipe 13..18, delivery 19, kind 20..25, piles 26..28.
 # Bits of the second word, the agents: self 0..12 (position 1 bit, facing 4, hand 8), other agent 13..25.
 TIMER_BIT, RECIPE_BIT, DELIVERY_BIT, FIXED_BIT, _PILES = 8, 13, 19, 20, 26
-AGENT_BITS = 13
+AGENT_BITS, CELL_BIT = 13, 20
 _STATIC = (WALL, GOAL, POT, INDICATOR, BUTTON, PLATES)
 
 
@@ -76,7 +76,8 @@ class Tables(NamedTuple):
             the number is the cell's position in `pots`, `counters` or `buttons`.
         moves: uint8 (cells, 6), an agent's next cell by its cell and action, if the other agent does not block it.
         view: int32 (cells, 25), for each agent position and window cell: number of the cell's changing word; from bit 8
-            on, the fixed bits of its word, shifted down by FIXED_BIT.
+            on, the fixed bits of its word, shifted down by FIXED_BIT; from CELL_BIT on, the cell's number, or NOWHERE
+            outside the map.
         own: bits of the layout's own channels.
         canonical: bits of the canonical channels; empty if an ingredient of the layout has no canonical channel.
         pots: uint8 (P,), cells of the pots in reading order; padding is NOWHERE, as in `buttons` and `counters`.
@@ -273,7 +274,8 @@ def _view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.nda
         pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
         fixed |= pile.astype(np.int32) << (_PILES - FIXED_BIT + bit)
     # Cells outside the map get 0: changing word number 0 is always zero, and no fixed bits are set.
-    return np.where(layout.window >= 0, (changing | fixed << 8)[layout.window], 0).astype(np.int32)
+    packed = changing | fixed << 8 | np.arange(layout.cells) << CELL_BIT
+    return np.where(layout.window >= 0, packed[layout.window], NOWHERE << CELL_BIT).astype(np.int32)
 
 
 def _channel_bits(layout: Layout, types: int, delivery: bool) -> ChannelBits:
