@@ -68,8 +68,8 @@ LEARNERS = {
 """Name on the command line and in folders -> learner."""
 
 _MODEL = ModelOptions(**{**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0})
-# The script `search` finds out the dish within the first episodes, so windows begin at a history's start.
-_FIRST_EPISODES = {"search": 5, "all": 5}
+# The script `search` finds out the dish within these first episodes, so windows begin at a history's start.
+_FIRST_EPISODES = 5
 _TRAINING: dict[str, Any] = {"learning_rate": 2e-3, "validate_every": 10**6, "save_every": 10**6, "log_every": 20}
 
 
@@ -139,10 +139,15 @@ class ProofJob(TrainingJob):
         return f"{LEARNERS[self.learner].title}, {self.source} histories, seed {self.seed}"
 
     @property
+    def first(self) -> int:
+        """Number of first episodes of each history to train on; 0 for all episodes."""
+        return _FIRST_EPISODES if self.source in ("search", "all") else 0
+
+    @property
     def settings(self) -> dict[str, Any]:
         """All settings that the result depends on, as JSON; the content of the release is not among them."""
         tasks = {name: [task.task_id for task in own] for name, own in self.options.task_sets.items()}
-        return {"train": asdict(self.training), "root": self.options.root, "tasks": tasks}
+        return {"train": asdict(self.training), "root": self.options.root, "tasks": tasks, "first": self.first}
 
     def finished_text(self) -> str:
         """Return a note on the result for progress displays: mean returns on the track preference."""
@@ -153,8 +158,9 @@ class ProofJob(TrainingJob):
         """Train the model, and return the `minutes` of training and the `returns` of `play_sets`."""
         learner, run = LEARNERS[self.learner], self.run_folder
         source = () if self.source == "all" else (self.source,)
-        release, first = self.options.root, _FIRST_EPISODES.get(self.source, 0)
-        histories = HistoryOptions((ALL_LAYOUTS,), release, source=source, labels=learner.labels, first=first)
+        histories = HistoryOptions(
+            (ALL_LAYOUTS,), self.options.root, source=source, labels=learner.labels, first=self.first
+        )
         prepare(learner.method, _MODEL, self.training, histories).train(run, done=self.step_progress(on_update))
         return {
             "minutes": round(_training_seconds(run / TIMING) / 60, 1),

@@ -44,9 +44,9 @@ _BLOCK = 2**12  # number of entries in memory at a time
 _DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int64, float | None: np.float64}
 # The fields `history_id` and `obs_shape` have no columns, since the row and the layout determine their values.
 _NUMBERS = {name: _DTYPES[hint] for name, hint in ENTRY_HINTS.items() if hint in _DTYPES and name != "history_id"}
-_STAND_INS = {int | None: -1, float | None: np.nan}  # values that stand for None in columns; "" in string columns
+_NONE_AS = {int | None: -1, float | None: np.nan}  # numbers that are stored for None; string columns store ""
 _STRINGS = tuple(name for name, hint in ENTRY_HINTS.items() if hint in TEXTS or name in ENCODED)
-_ABSENT = {name: _STAND_INS.get(hint, "") for name, hint in ENTRY_HINTS.items() if type(None) in get_args(hint)}
+_ABSENT = {name: _NONE_AS.get(hint, "") for name, hint in ENTRY_HINTS.items() if type(None) in get_args(hint)}
 _names = attrgetter(*_STRINGS)
 
 

@@ -197,12 +197,13 @@ def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = N
     for cells in (layout.pots, layout.counters, layout.buttons):
         number[list(cells)] = range(len(cells))
     row, column = np.divmod(np.arange(layout.cells, dtype=np.int32), layout.width)
-    # The positions in the window of the cells above, below, left and right; -1 outside the map.
-    beside = layout.window[:, [CENTRE - WINDOW, CENTRE + WINDOW, CENTRE - 1, CENTRE + 1]]
-    near = np.bitwise_or.reduce(np.where(beside >= 0, 1 << kinds.astype(int)[beside], 0), axis=1).astype(np.uint8)
+    # Numbers of the cells above, below, left and right of each cell; -1 outside the map.
+    neighbours = layout.window[:, [CENTRE - WINDOW, CENTRE + WINDOW, CENTRE - 1, CENTRE + 1]]
+    bits = np.where(neighbours >= 0, 1 << kinds.astype(int)[neighbours], 0)
+    near = np.bitwise_or.reduce(bits, axis=1).astype(np.uint8)
     distance, first_step = _shortest_paths(layout)
     # A neighbour of -1 indexes the last cell, but `where` replaces this value.
-    to_access = np.where((beside >= 0) & walkable[beside], distance[:, beside], NOWHERE).min(axis=-1)
+    to_access = np.where((neighbours >= 0) & walkable[neighbours], distance[:, neighbours], NOWHERE).min(axis=-1)
     canonical = CANONICAL_TYPES if layout.ingredient_types <= CANONICAL_TYPES else 0
     sizes = [len(room) for room in layout.rooms]
     return Tables(
@@ -273,7 +274,7 @@ def _view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.nda
     for bit, ingredient in enumerate(layout.ingredients):
         pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
         fixed |= pile.astype(np.int32) << (_PILES - FIXED_BIT + bit)
-    # Cells outside the map get 0: changing word number 0 is always zero, and no fixed bits are set.
+    # Cells outside the map have changing word 0, which is always zero, no fixed bits, and a number that no cell has.
     packed = changing | fixed << 8 | np.arange(layout.cells) << CELL_BIT
     return np.where(layout.window >= 0, packed[layout.window], NOWHERE << CELL_BIT).astype(np.int32)
 

@@ -127,7 +127,7 @@ class Handler(BaseHTTPRequestHandler):
     do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = answer
 
     def _read(self, size: int) -> bytes:
-        """Read the complete body of a request, whose connection may end too early."""
+        """Read the complete body of a request; the client may close the connection before its end."""
         found = self.rfile.read(size)
         if len(found) < size:
             raise ConnectionAbortedError(f"{self.path}: received {len(found)} of {size} bytes of the request")

@@ -110,7 +110,7 @@ def roll_out(
 
     Args:
         env: the environment.
-        players: players whose agent slots cover 0..2N-1, each exactly once, for N environments.
+        players: the players of N environments; together they play all agent slots 0..2N-1, each slot once.
         carry: carry from `init_rollout` or the previous rollout.
         steps: number T of steps.
         key: JAX key for the players' random draws; environments use their own keys.

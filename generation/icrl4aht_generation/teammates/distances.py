@@ -94,7 +94,7 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
     Raises:
         UnknownNameError: if the benchmark does not have the layout.
     """
-    records, tested = common_states(layout, _EPISODES)
+    records, tested = common_states(layout)
     actions = act_on_records(layout, policies, records)
     distances = distances_to_tests(tested, actions)
     nearest = distances.argmin(axis=1)

@@ -1,4 +1,4 @@
-"""Test memory and partner controls and the protocol `swap`, with an ego whose actions depend on its memory."""
+"""Test the memory control, the partner control and the protocol `swap`; the ego acts by its memory."""
 
 from __future__ import annotations
 

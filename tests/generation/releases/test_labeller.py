@@ -40,7 +40,10 @@ from tests.helpers.tiny import artefact
 
 
 def returns_with_means(*means: float, spread: float = 0.0) -> np.ndarray:
-    """Make episode returns (C, E) of C checkpoints with the given means, whose differences deviate by `spread`."""
+    """Return episode returns (C, E) of C checkpoints with the given means.
+
+    `spread` is the standard deviation of the difference between two checkpoints in an episode.
+    """
     noise = np.random.default_rng(0).normal(size=(len(means), LABEL_EPISODES)) * spread / np.sqrt(2)
     return np.array(means)[:, None] + noise - noise.mean(axis=1, keepdims=True)
 
