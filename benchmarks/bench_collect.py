@@ -111,7 +111,7 @@ def collection_memory(updates: int) -> dict[str, Any]:
 def peak_of_learning(updates: int, recording: bool) -> float:
     """Return this process's peak memory in MiB after learning, or after collecting and saving at every update."""
     profile = load_profile("paper")
-    # Memory depends on the paper's number of environments and rollout length, so a small, fast network is enough.
+    # The number of environments and the rollout length, not the network, determine the memory: a small network is fast.
     profile = replace(profile, ego=replace(profile.ego, widths=Widths((4,), (4,), 8, 8, 8)))
     if recording:
         collect_some(profile, updates, save_seconds=0)

@@ -2,10 +2,11 @@
 
 All readers make the same windows of the same histories, which are bundled histories rotated by complete episodes:
 
-    published   h5py, float32 gzip-6, chunks of 4096, slices merged per history, 512 MB chunk cache, one thread
-    fair        the same data in chunks of 500, read_direct into a preallocated batch
-    ours        caches ram, mmap and stream (with and without decoded chunks in memory); state records, uint8 and
-                float32 observations; batch buffers are reused
+    published   one thread reads float32 data, compressed by gzip level 6 in chunks of 4096 steps, with h5py; it merges
+                the slices of a history, and has a chunk cache of 512 MB
+    fair        h5py reads the same data in chunks of 500 steps directly into a preallocated batch
+    ours        reads state records, or uint8 or float32 observations, with each cache (ram, mmap, and stream with and
+                without decoded chunks in memory), into reused batch buffers
 
 Readers take turns in rounds. One JSON line is printed for each of our readers and each peer, with the ratio of both and
 our target ratio to the reader `published`.

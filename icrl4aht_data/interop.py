@@ -138,7 +138,7 @@ class _PassSampler:
         return len(self._numbers)
 
     def __iter__(self) -> Iterator[int]:
-        # A generator: with workers, DataLoader makes two iterators in its first pass but uses only one.
+        # This is a generator, because with workers, DataLoader makes two iterators in its first pass but uses only one.
         numbers = self._numbers
         self._numbers = range(numbers.stop, numbers.stop + self._size)
         yield from numbers

@@ -279,7 +279,7 @@ class Scene:
         cells = self.neighbours(target)
         return jnp.where((cells >= 0) & jnp.asarray(self.tables.walkable)[cells], cells, -1)
 
-    def only_access(self, target: Int[Array, ""]) -> Int[Array, ""]:
+    def single_access(self, target: Int[Array, ""]) -> Int[Array, ""]:
         """Return the only access cell of a target; -1 if the target has none or several."""
         access = self.access(target)
         return jnp.where(jnp.sum(access >= 0) == 1, jnp.max(access), -1)

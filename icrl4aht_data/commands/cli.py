@@ -109,7 +109,7 @@ class VerbGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def _verbs(self) -> dict[str, Verb]:
-        """Return the `Verb` of each command of this group by the name's last word, in the order of the headings."""
+        """Return the `Verb` of each command by its name in this group, in the order of the help text."""
         found = {
             name.removeprefix(self._prefix): verb
             for name, verb in all_verbs().items()

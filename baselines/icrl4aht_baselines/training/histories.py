@@ -373,7 +373,9 @@ def read_trained(folder: Path) -> TrainedModel:
         method = get_method(config["method"])(model, world)
         context, cells = train["context"], config["trained_on"]
     except (KeyError, TypeError) as error:
-        raise OptionError(f"{folder}: its config.json is not of a run on learning histories: {error!r}") from error
+        raise OptionError(
+            f"{folder}: its config.json does not describe a run on learning histories: {error!r}"
+        ) from error
     if expected != obs_shape:
         raise OptionError(
             f"{folder}: trained on observations {obs_shape}, but {layouts[0].name} with {channels} channels has "

@@ -74,7 +74,7 @@ class TestBadRuns:
         wide = dataclasses.asdict(dataclasses.replace(MODEL, width=32))
         with pytest.raises(OptionError, match=r"not a state of this training: params/.*expected float32 .*, found"):
             find_agent(copy("wider", model=wide))
-        with pytest.raises(OptionError, match="not of a run on learning histories: KeyError"):
+        with pytest.raises(OptionError, match="does not describe a run on learning histories: KeyError"):
             find_agent(copy("other", model={}, histories={}))
         shutil.rmtree(Path(copy("early")) / "checkpoints")
         with pytest.raises(OptionError, match="no checkpoint yet; continue the training"):

@@ -223,7 +223,7 @@ AWAY = ((2, 3, "down"), (6, 3, "down"))  # the agents face the counters (2, 4) a
         ([0, SOUP_111], 0, {}, 3),
         ([ZERO, 0], PLATE, {}, 0),  # the other agent holds a plate for the only pot in use
         ([ZERO, ONE], PLATE, {}, 3),
-        ([ZERO, 0], DISH_000, {}, 3),  # a dish does not count as a plate
+        ([ZERO, 0], DISH_000, {}, 3),  # a plate with soup does not count as an empty plate
         ([ZERO, 0], 0, {(1, 4): PLATE}, 0),
         ([ZERO, ONE], 0, {(6, 4): PLATE}, 0),
         ([ZERO, 0], 0, {(1, 4): ZERO, (6, 4): DISH_000}, 3),  # other items do not count as plates

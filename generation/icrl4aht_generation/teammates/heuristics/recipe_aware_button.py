@@ -194,7 +194,7 @@ def _step(scene: Scene, target: Int[Array, ""], cramped: Bool[Array, ""]) -> Int
 
 def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Return whether a partner with an ingredient is about as near to the pot, and a step away from the pot."""
-    access = scene.only_access(pot)
+    access = scene.single_access(pot)
     as_near = scene.manhattan(scene.partner, access) <= scene.manhattan(scene.me, access) + 1
     gives_way = is_ingredient(scene.partner_hand) & (access >= 0) & as_near
     return gives_way, scene.best_way(scene.free, scene.manhattan(scene.ways, access))
@@ -203,7 +203,7 @@ def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[
 def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
     """Return whether to leave plates that have only one access cell to a partner who carries no plate or dish."""
     first = jnp.argmax(scene.plate_piles)
-    single = jnp.any(scene.plate_piles) & (scene.only_access(first) >= 0)
+    single = jnp.any(scene.plate_piles) & (scene.single_access(first) >= 0)
     carries = (scene.partner_hand == PLATE) | is_dish(scene.partner_hand)
     return ~carries & single
 

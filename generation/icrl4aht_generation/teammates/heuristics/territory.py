@@ -117,7 +117,7 @@ def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
     step = jnp.where(goes_around, scene.sidestep(STAY), step)
     if scene.slot == 0:
         return step
-    access = scene.only_access(target)
+    access = scene.single_access(target)
     near = scene.distances(scene.partner)[access] <= 1
     waits = (access >= 0) & near & (cost <= 2) & (params["yield_bias"] >= np.float32(0.1))
     return jnp.where(waits, STAY, step)
