@@ -35,7 +35,7 @@ from icrl4aht_data.writing.convert import to_release
 from tests.helpers.commands import run_cli
 from tests.helpers.damages import flip_bit
 from tests.helpers.paths import ROOT
-from tests.helpers.plugins import installed, write_package
+from tests.helpers.plugins import installed_plugins, write_package
 from tests.helpers.random_releases import random_history, random_release
 from tests.helpers.tiny import TINY
 from tests.packaging.test_readme import check_arguments, code_blocks, shell_calls
@@ -96,7 +96,7 @@ def example_package(tmp_path) -> Iterator[None]:
     source = DOCS / "my_overcooked"
     project = tomllib.loads((source / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     modules = {path.stem: path.read_text(encoding="utf-8") for path in (source / "my_overcooked").glob("*.py")}
-    with installed(write_package(tmp_path / "site", project["name"], modules, project["entry-points"])):
+    with installed_plugins(write_package(tmp_path / "site", project["name"], modules, project["entry-points"])):
         yield
 
 
@@ -176,12 +176,12 @@ class TestFormatPage:
         with pytest.raises(KeyError):
             reader_functions["read"](tmp_path / "shards", 0, "expert_actions")
 
-    def test_read_release_script_raises_error_on_damaged_bytes(self, reader_functions, damaged):
-        shard = damaged / load_icrl4aht(damaged).entries[0].shard
-        table = np.load(damaged / "meta/chunks" / shard.relative_to(damaged / "data").with_suffix(".npy"))
+    def test_read_release_script_raises_error_on_damaged_bytes(self, reader_functions, release_copy):
+        shard = release_copy / load_icrl4aht(release_copy).entries[0].shard
+        table = np.load(release_copy / "meta/chunks" / shard.relative_to(release_copy / "data").with_suffix(".npy"))
         flip_bit(shard, int(table["offset"][0]) + 5)
         with pytest.raises(ValueError, match="are damaged"):
-            reader_functions["read"](damaged, 0, "state")
+            reader_functions["read"](release_copy, 0, "state")
 
     @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=str)
     def test_read_release_script_unpacks_and_observes_like_the_package(self, reader_functions, layout):

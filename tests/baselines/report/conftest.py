@@ -9,13 +9,13 @@ import pytest
 
 from icrl4aht_data.benchmark import best_responses
 from icrl4aht_data.benchmark.best_responses import BestResponseCard, write_best_responses
-from tests.helpers.evaluated import write_measured
+from tests.helpers.evaluated import write_invented_responses
 
 
 @pytest.fixture(scope="session")
 def response_files(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("cards")
-    write_measured(folder / "measured.json")
+    write_invented_responses(folder / "measured.json")
     write_best_responses(folder / "none.json", BestResponseCard("0", "seeded", "None measured."))
     return folder
 

@@ -11,7 +11,7 @@ from icrl4aht_baselines.report.page import write_page
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, ResultCell
 from PIL import Image
 
-from tests.helpers.chromium import NEEDS_CHROMIUM, PHONE, check_phone, chromium
+from tests.helpers.chromium import NEEDS_CHROMIUM, PHONE, check_fits_phone, chromium
 from tests.helpers.evaluated import evaluated_run
 
 pytestmark = [pytest.mark.slow, NEEDS_CHROMIUM]
@@ -44,4 +44,4 @@ def test_report_fits_the_width_of_a_phone(report_file, dark):
         page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true })")
         assert page.locator("section").count() == 6
         assert page.evaluate(TOO_WIDE, PHONE) == []
-        check_phone(page, dark)
+        check_fits_phone(page, dark)

@@ -17,7 +17,7 @@ from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_respo
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
 from icrl4aht_data.errors import OptionError
-from tests.helpers.evaluated import SPAN, TEST_TASKS, evaluated_run, write_measured
+from tests.helpers.evaluated import SPAN, TEST_TASKS, evaluated_run, write_invented_responses
 
 DEMO_WIDE = [ResultCell("demo_wide", family) for family in HEURISTICS]
 WIDE, RING, FLAT = ResultCell("demo_wide", "H1"), ResultCell("coord_ring", "H2"), ResultCell("demo_simple", "H1")
@@ -104,7 +104,7 @@ def test_score_scales_cover_all_tasks_with_a_best_response(invented_responses):
 def test_damaged_file_of_best_responses_raises_error(tmp_path):
     with pytest.raises(OptionError, match=r"none\.json: no such file, expected best responses"):
         read_best_responses(tmp_path / "none.json")
-    card = read_best_responses(write_measured(tmp_path / "b.json"))
+    card = read_best_responses(write_invented_responses(tmp_path / "b.json"))
     assert card.version == "7" and isinstance(card.behaviours[0], BestResponse)
     text = (tmp_path / "b.json").read_text()
     (tmp_path / "twice.json").write_text(text.replace('"behaviours": [', f'"behaviours": [{text.splitlines()[5]}', 1))

@@ -34,7 +34,7 @@ from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, Option
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
 from tests.helpers.spoiled import read_lines
-from tests.helpers.tiny import start
+from tests.helpers.tiny import start_python
 from tests.helpers.two_sources import two_source_release
 from tests.helpers.xla_flags import add_xla_flag
 
@@ -431,7 +431,7 @@ def check_two_devices(
     log: list[dict[str, Any]], root: Path, folder: Path, environments: list[dict[str, str]], *arguments: str
 ) -> list[str]:
     """Train in a process for each dict of environment variables, check the log, and return each process's output."""
-    processes = [start("-c", DEVICES, str(root), str(folder), *arguments, **one) for one in environments]
+    processes = [start_python("-c", DEVICES, str(root), str(folder), *arguments, **one) for one in environments]
     outputs = [process.communicate(timeout=240) for process in processes]
     for process, (_, error) in zip(processes, outputs, strict=True):
         assert process.returncode == 0, error
