@@ -1,4 +1,4 @@
-"""Invented best responses, so that tests of scores do not depend on those of the package."""
+"""Fixtures that replace the package's best responses, which tests of scores must not depend on."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def response_files(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def no_responses(response_files) -> Iterator[None]:
-    """Replace the package's best responses by an empty set."""
+def empty_responses(response_files) -> Iterator[None]:
+    """Replace the package's best responses with an empty set."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(best_responses, "best_responses_file", lambda: response_files / "none.json")
         yield
 
 
 @pytest.fixture
-def invented_responses(no_responses, response_files, monkeypatch) -> None:
-    """Replace the package's best responses by the invented ones of `write_measured`."""
+def invented_responses(empty_responses, response_files, monkeypatch) -> None:
+    """Replace the package's best responses with the invented ones that `write_measured` writes."""
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: response_files / "measured.json")
