@@ -39,9 +39,7 @@ import jax.numpy as jnp
 from icrl4aht_baselines.agents.egos import trained_policy
 from icrl4aht_baselines.evaluate.evaluator import play_episodes, prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
-from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.options import SIZES
-from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_baselines.training.trainer import Trainer
 from icrl4aht_generation.learners.config import EncoderKind, PPOConfig, Widths
@@ -50,11 +48,11 @@ from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.teammates.instances import published_tasks
 from jax.extend.backend import get_backend
 
-from benchmarks.bench_learn import heuristic_learner, size_options
+from benchmarks.bench_learn import ad_method, heuristic_learner
 from benchmarks.harness import compile_measured, elapsed, print_line
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.system import usable_cores
 
 _LAYOUT = "demo_wide"
@@ -202,7 +200,8 @@ def _training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, p
     length = context_length(sizes, size)
     dataset = load_icrl4aht(split="train", source="ppo", layout=_LAYOUT, obs="state")
     options = TrainOptions(batch_size=sizes.batch, context=length, accumulate=parts)
-    trainer = Trainer(ad_method(size, encoder, dtype, dataset.layouts), options)
+    method = ad_method(size, dataset.layouts, encoder=encoder, bfloat16=dtype == "bfloat16")
+    trainer = Trainer(method, options)
     state = trainer.init()
     with trainer.batches(dataset.ad(batch_size=sizes.batch, length=length, seed=0), 0, sys.maxsize) as batches:
         batch = next(batches)
@@ -243,7 +242,7 @@ def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) ->
     context = context_length(sizes, size)
     layout = get_layout(_LAYOUT)
     tasks = h4_tasks()[: sizes.tasks]
-    method = ad_method(size, encoder, "float32", [layout])
+    method = ad_method(size, [layout], encoder=encoder)
     policy = trained_policy(method, method.init(jax.random.key(0)), context)
     protocol = replace(PROTOCOLS["seeded"], steps=sizes.episode_steps, episodes=sys.maxsize)
     started = time.perf_counter()
@@ -274,12 +273,6 @@ def h4_tasks() -> list[Task]:
 def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
     """Return the learner of an ego with teammate H4, with the paper's network but the given encoder."""
     return heuristic_learner(get_layout(_LAYOUT), replace(sizes.ppo, widths=Widths(encoder=encoder)))
-
-
-def ad_method(size: str, encoder: EncoderKind, dtype: str, layouts: Sequence[Layout]) -> Method:
-    """Return the method AD of a model size, for batches of state records on some layouts."""
-    model = size_options(size, encoder=encoder, bfloat16=dtype == "bfloat16")
-    return get_method("ad")(model, overcooked_world(layouts, encoder))
 
 
 def context_length(sizes: Sizes, size: str) -> int:

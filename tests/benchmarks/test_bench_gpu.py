@@ -25,12 +25,12 @@ from benchmarks.bench_gpu import (
     FULL_SIZES,
     PARTS,
     SMALL_SIZES,
-    ad_method,
     context_length,
     ego_learner,
     h4_tasks,
     measure_training,
 )
+from benchmarks.bench_learn import ad_method
 from benchmarks.harness import product_flops
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.overcooked.actions import TEAMMATE
@@ -119,7 +119,7 @@ def test_training_steps_of_models_can_be_lowered_for_cuda(case):
     """Programs with the sizes that the benchmark uses on a GPU are lowered, but not compiled."""
     size, encoder, dtype = case.split("/")
     dataset, length = load_icrl4aht(layout="demo_wide", obs="state"), context_length(FULL_SIZES, size)
-    method = ad_method(size, encoder, dtype, dataset.layouts)  # type: ignore[arg-type]
+    method = ad_method(size, dataset.layouts, encoder=encoder, bfloat16=dtype == "bfloat16")
     trainer = Trainer(method, TrainOptions(batch_size=FULL_SIZES.batch, context=length))
     batch = dataset.ad(batch_size=1, length=length, seed=0)[0]
 
@@ -133,7 +133,7 @@ def test_training_steps_of_models_can_be_lowered_for_cuda(case):
 
 def test_evaluation_episode_can_be_lowered_for_cuda():
     tasks = h4_tasks()[:2]
-    method = ad_method("tiny", "mlp", "float32", [tasks[0].layout])
+    method = ad_method("tiny", [tasks[0].layout], encoder="mlp")
     params = jax.eval_shape(method.init, jax.random.key(0))
     mates = [build_teammate(task.layout, task.teammate, TEAMMATE, "seeded") for task in tasks]
     rollout = EvaluationRollout(tasks[0].layout, trained_policy(method, params, 10), mates, PROTOCOLS["seeded"])
