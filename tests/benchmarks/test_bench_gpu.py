@@ -47,7 +47,15 @@ MEASURED = {
 """Keys that each benchmark case must print, by part of the benchmark."""
 
 
-def lines_of(output: str) -> dict[str, dict[str, Any]]:
+@pytest.fixture(autouse=True)
+def optimizations():
+    """Restore the compiler's optimizations, which the command disables on a CPU."""
+    before = jax.config.values["jax_disable_most_optimizations"]
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+def lines_by_case(output: str) -> dict[str, dict[str, Any]]:
     return {line["case"]: line for line in map(json.loads, re.findall("^{.*", output, re.MULTILINE))}
 
 
@@ -58,7 +66,7 @@ def test_gpu_benchmark_prints_expected_keys_of_each_case(monkeypatch):
     assert {case.split("/")[0] for case in cases} == set(PARTS)
     options = [word for case in cases for word in ("--case", case)]
     monkeypatch.chdir(ROOT)
-    found = lines_of(run_cli(*options, "--seconds", 0.01, program=bench_gpu.main))
+    found = lines_by_case(run_cli(*options, "--seconds", 0.01, program=bench_gpu.main))
     assert list(found) == cases
     for case, line in found.items():
         assert MEASURED[case.split("/")[0]] <= line.keys(), case
@@ -70,7 +78,7 @@ def test_gpu_benchmark_prints_expected_keys_of_each_case(monkeypatch):
 def test_command_ends_at_the_time_limit_with_a_line_for_each_case():
     command = [sys.executable, "-m", "benchmarks.bench_gpu", "--minutes", "0"]
     ended = subprocess.run(command, cwd=ROOT, env=python_environment(), capture_output=True, text=True, check=False)
-    found = lines_of(ended.stdout)
+    found = lines_by_case(ended.stdout)
     assert (ended.returncode, found.keys()) == (1, CASES.keys())
     assert all(line["error"] == "no time left" for line in found.values())
 
@@ -79,7 +87,7 @@ def test_error_of_a_case_is_reported_and_the_other_cases_are_measured(monkeypatc
     monkeypatch.setitem(CASES, "device", lambda sizes: {"cores": 2})
     monkeypatch.setitem(CASES, "product", lambda sizes: 1 / 0)
     printed = run_cli("--part device --part product", code=1, program=bench_gpu.main)
-    assert lines_of(printed) == {
+    assert lines_by_case(printed) == {
         "device": {"benchmark": "gpu", "case": "device", "cores": 2},
         "product": {"benchmark": "gpu", "case": "product", "error": "ZeroDivisionError: division by zero"},
     }
@@ -88,13 +96,13 @@ def test_error_of_a_case_is_reported_and_the_other_cases_are_measured(monkeypatc
 def test_batch_that_does_not_fit_in_memory_is_split(monkeypatch):
     tried = []
 
-    def steps(sizes, size, encoder, dtype, parts):
+    def fake_training_steps(sizes, size, encoder, dtype, parts):
         tried.append(parts)
         if parts < 4:
             raise (MemoryError("96 GiB"), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: .."))[parts - 1]
         return {"accumulate": parts}
 
-    monkeypatch.setattr(bench_gpu, "_training_steps", steps)
+    monkeypatch.setattr(bench_gpu, "_training_steps", fake_training_steps)
     measure = partial(measure_training, size="small", encoder="paper", dtype="float32")
     assert measure(FULL_SIZES) == {"accumulate": 4}
     assert tried == [1, 2, 4]
