@@ -17,10 +17,10 @@ from tests.servers.process import hub_environment, hub_settings
 
 
 class Hub(HubState):
-    """A running test Hub; the variables in `environment` direct another process to the Hub.
+    """A running test Hub; the environment variables in `environment` direct other processes to the Hub.
 
-    A second port, the CDN, receives and serves large files by SHA-256. Requests to the CDN are in the same log, as
-    `/lfs/{sha256}` and `/cdn/{sha256}/{name}`, and the same faults apply.
+    A second server, the CDN, receives and serves large files by SHA-256. Its requests are in the same log, with the
+    paths `/lfs/{sha256}` and `/cdn/{sha256}/{name}`, and the same faults apply.
 
     Args:
         root: empty folder for contents and for the client's caches.

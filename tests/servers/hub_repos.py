@@ -18,7 +18,7 @@ LFS_BYTES = 10 << 20  # files of at least this size are stored by LFS, whatever 
 
 
 class Refusal(Exception):
-    """An error with which the test Hub answers a request.
+    """Error that makes the test Hub answer a request with an error status.
 
     Args:
         status: HTTP status of the answer.
@@ -71,7 +71,7 @@ class Commit:
 
 @dataclass
 class Repo:
-    """A dataset repository. Every commit stays readable by its hash."""
+    """A dataset repository, whose commits can be read by branch, tag or hash."""
 
     id: str
     private: bool = False
@@ -80,7 +80,7 @@ class Repo:
     commits: dict[str, Commit] = field(default_factory=dict)
 
     def resolve(self, revision: str) -> Commit:
-        """Return the commit of a branch, a tag, or a commit's hash."""
+        """Return the commit that a revision names: a branch, a tag, or the hash of a commit."""
         commit = self.commits.get(self.branches.get(revision) or self.tags.get(revision) or revision)
         if commit is None:
             raise Refusal(404, f"Invalid rev id: {revision}", "RevisionNotFound")
@@ -105,18 +105,18 @@ class Blobs:
         root.mkdir(parents=True)
 
     def path(self, sha256: str) -> Path:
-        """Return the path at which content with a SHA-256 is stored; the file may not exist."""
+        """Return the path of the content with a given SHA-256; the file exists only if the content is stored."""
         return self._root / sha256
 
     def add(self, data: bytes, lfs: bool) -> File:
-        """Store the content of a file."""
+        """Store the content of a file, and return a description of the file for a commit."""
         sha256 = hashlib.sha256(data).hexdigest()
         if not self.path(sha256).exists():  # do not overwrite a file that a client may be downloading
             self.path(sha256).write_bytes(data)
         return self.file(sha256, lfs)
 
     def file(self, sha256: str, lfs: bool) -> File:
-        """Return the commit's description of a file with stored content."""
+        """Return a description, for a commit, of a file with stored content."""
         size = self.path(sha256).stat().st_size
         in_git = _pointer(sha256, size) if lfs else self.path(sha256).read_bytes()
         return File(sha256, size, hashlib.sha1(b"blob %d\0" % len(in_git) + in_git).hexdigest(), lfs)

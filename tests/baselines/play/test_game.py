@@ -1,4 +1,4 @@
-"""Test games of people and policies: returns equal an evaluation's, and egos can play in either slot."""
+"""Test games of people and policies: returns equal those of an evaluation, and egos can play in either slot."""
 
 from __future__ import annotations
 

@@ -40,10 +40,10 @@ def test_teammate_id_depends_only_on_the_policy():
 
 
 def test_teammate_ids_are_none_for_releases_without_tasks(dataset, monkeypatch):
-    def recover(history_id):
+    def raise_not_stored(history_id):
         raise NotStoredError("no tasks")
 
-    monkeypatch.setattr(dataset, "recover_teammate", recover)
+    monkeypatch.setattr(dataset, "recover_teammate", raise_not_stored)
     assert teammate_ids(dataset, dataset.ids.tolist()) is None
 
 
