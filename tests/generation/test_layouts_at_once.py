@@ -24,7 +24,7 @@ ENVS, STEPS = 3 * len(NAMES), 30
 
 
 @pytest.fixture(scope="module")
-def played() -> dict[str, np.ndarray]:
+def recorded_steps() -> dict[str, np.ndarray]:
     """Play two episodes of random actions; return arrays (steps, environments, ...) by name."""
     env = Environment(GROUP, max_steps=STEPS)
 
@@ -54,10 +54,10 @@ def keys_of(count: int) -> jax.Array:
 
 
 @pytest.mark.parametrize("number", range(len(NAMES)), ids=NAMES)
-def test_layout_in_a_group_plays_like_a_single_layout(played, number):
+def test_layout_in_a_group_plays_like_a_single_layout(recorded_steps, number):
     layout, envs = GROUP[number], np.arange(number, ENVS, len(NAMES))
     own = padded_positions(layout, stack_tables(GROUP))
-    part = {name: value[:, envs] for name, value in played.items()}
+    part = {name: value[:, envs] for name, value in recorded_steps.items()}
     assert (part["layout"] == number).all()
     records, final = part["record"][..., own], part["final"][..., own]
     others = np.setdiff1d(np.arange(part["record"].shape[-1]), own)

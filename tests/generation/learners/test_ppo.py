@@ -81,21 +81,21 @@ def update(learner) -> UpdateFunction:
 
 
 @pytest.fixture(scope="module")
-def untrained(learner) -> LearnerState:
+def initial_state(learner) -> LearnerState:
     return jax.jit(learner.init)(jax.random.key(3))
 
 
 @pytest.fixture(scope="module")
-def frozen(untrained) -> LearnerState:
+def frozen_state(initial_state) -> LearnerState:
     """Return a state at the end of the learning-rate schedule, where updates change no parameters. Random parameters
     make logits and values vary with the hidden state."""
     rng = np.random.default_rng(0)
-    params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.3, untrained.params)
+    params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.3, initial_state.params)
     steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
     optimizer = jax.tree.map(
-        lambda x: jnp.full_like(x, steps) if jnp.issubdtype(x.dtype, jnp.integer) else x, untrained.optimizer
+        lambda x: jnp.full_like(x, steps) if jnp.issubdtype(x.dtype, jnp.integer) else x, initial_state.optimizer
     )
-    return untrained._replace(params=params, optimizer=optimizer)
+    return initial_state._replace(params=params, optimizer=optimizer)
 
 
 class UpdateSequence(NamedTuple):
@@ -115,14 +115,14 @@ def run_updates(update: UpdateFunction, state: LearnerState, updates: int) -> Up
 
 
 @pytest.fixture(scope="module")
-def played(update, frozen) -> UpdateSequence:
-    """Return 40 updates from the state `frozen`, in which the policy never changes."""
-    return run_updates(update, frozen, 40)
+def played(update, frozen_state) -> UpdateSequence:
+    """Return 40 updates from the fixture `frozen_state`, in which the policy never changes."""
+    return run_updates(update, frozen_state, 40)
 
 
 @pytest.fixture(scope="module")
-def trained(update, untrained) -> UpdateSequence:
-    return run_updates(update, untrained, CONFIG.updates)
+def trained(update, initial_state) -> UpdateSequence:
+    return run_updates(update, initial_state, CONFIG.updates)
 
 
 def ego_choices(rollout: Rollout) -> Choice:
@@ -220,9 +220,9 @@ def test_ppo_loss_equals_formulas_in_numpy(learner, played):
     np.testing.assert_allclose(total, policy + 0.5 * value_loss - 0.01 * entropy, rtol=1e-4, atol=1e-5)
 
 
-def test_teammate_actions_depend_on_the_parameters_in_the_state(update, frozen, played):
+def test_teammate_actions_depend_on_the_parameters_in_the_state(update, frozen_state, played):
     """The same compiled update can train with every teammate of a family."""
-    state, rollout, _ = update(frozen._replace(teammate={"turn": jnp.uint32(1)}))
+    state, rollout, _ = update(frozen_state._replace(teammate={"turn": jnp.uint32(1)}))
     first = played.rollouts[0].actions[0, :, TEAMMATE]
     np.testing.assert_array_equal(rollout.actions[0, :, TEAMMATE], (first + 1) % 4)
     assert int(state.teammate["turn"]) == 1

@@ -176,7 +176,7 @@ class StopTraining(Exception):
 
 
 @pytest.fixture
-def stopped(tmp_path, monkeypatch) -> Path:
+def stopped_suite(tmp_path, monkeypatch) -> Path:
     """Return a suite in which LBRDiv training stopped at its last update, after multipliers had changed."""
 
     def stop(updates: int, speed: float) -> None:
@@ -189,19 +189,19 @@ def stopped(tmp_path, monkeypatch) -> Path:
 
 
 @pytest.mark.slow
-def test_stopped_population_resumes_only_with_the_same_settings(trained, stopped):
-    before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
+def test_stopped_population_resumes_only_with_the_same_settings(trained, stopped_suite):
+    before = {path: path.read_bytes() for path in stopped_suite.rglob("*") if path.is_file()}
     with pytest.raises(
         OptionError,
         match=r"lbrdiv.resume\.safetensors: saved by a training run with other settings: seed was 0, now it is 1",
     ):
-        PopulationJob(replace(smoke_run("lbrdiv"), seed=1), stopped).run()
-    assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before
+        PopulationJob(replace(smoke_run("lbrdiv"), seed=1), stopped_suite).run()
+    assert {path: path.read_bytes() for path in stopped_suite.rglob("*") if path.is_file()} == before
 
     done: list[int] = []
-    population_job("lbrdiv", stopped).run(lambda updates, speed: done.append(updates))
+    population_job("lbrdiv", stopped_suite).run(lambda updates, speed: done.append(updates))
     assert done == [6]
-    folders = [population_folder(suite, "lbrdiv") for suite in (stopped, trained("lbrdiv"))]
+    folders = [population_folder(suite, "lbrdiv") for suite in (stopped_suite, trained("lbrdiv"))]
     assert weight_hashes(folders[0]) == weight_hashes(folders[1])
     assert not compare_rebuilds(*folders).differences
 

@@ -181,7 +181,7 @@ def compiled_teammates() -> tuple[dict, Callable]:
     return policies, jax.jit(jax.vmap(act, in_axes=(0, 0, 0, None)))
 
 
-def padded(layout: Layout, records: np.ndarray) -> tuple[Tables, np.ndarray]:
+def pad_inputs(layout: Layout, records: np.ndarray) -> tuple[Tables, np.ndarray]:
     """Return tables and records padded to common shapes, so that all layouts share one compilation."""
     tables, _, positions = padded_layout(layout)
     found = np.zeros((len(records), record_size(tables)), np.uint8)
@@ -191,7 +191,7 @@ def padded(layout: Layout, records: np.ndarray) -> tuple[Tables, np.ndarray]:
 
 def act_all(layout: Layout, params: dict, memories: dict, records: np.ndarray) -> dict:
     _, act = compiled_teammates()
-    tables, records = padded(layout, records)
+    tables, records = pad_inputs(layout, records)
     inputs = ([part[slot] for slot in ALL_SLOTS] for part in (params, memories))
     return dict(zip(ALL_SLOTS, act(*inputs, records, tables), strict=True))
 
