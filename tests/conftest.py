@@ -34,7 +34,7 @@ SharedFolder = Callable[[str, Callable[[Path], object]], Path]
 COMPILATION_CACHE: dict[str, Any] = {
     "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".cache" / "jax"),
     "jax_compilation_cache_max_size": 2 * 2**30,  # with a limit, JAX locks the folder, so processes can share the cache
-    "jax_persistent_cache_min_compile_time_secs": 0.1,  # with 0.5, tests take half more CPU time if the cache is filled
+    "jax_persistent_cache_min_compile_time_secs": 0.1,  # with 0.5, runs with a filled cache take 50% more CPU time
 }
 COSTLIEST = """
 collect notebooks wheel reference heuristics scripted rl2 suite generate run fetch gymnasium_env docs models trainer

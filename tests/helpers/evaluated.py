@@ -56,7 +56,7 @@ def evaluated_run(
 
 
 SPAN = 20.0
-"""Margin over `stay` of the best responses that `write_measured` invents, for teammates with headroom."""
+"""Margin over `stay` of the best responses that `write_invented_responses` invents, for teammates with headroom."""
 
 
 def write_invented_responses(path: Path) -> Path:

@@ -1,4 +1,4 @@
-"""An agent on the host that records its inputs."""
+"""An agent that runs on the host, in NumPy, and records its inputs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from icrl4aht_data.overcooked.actions import STAY
 
 
 class HostRecorder:
-    """An agent on the host that plays given actions, by default `stay`, and records its inputs and actions.
+    """An agent on the host that takes chosen actions, by default `stay`, and records its inputs and actions.
 
     Args:
         choose: function that takes the number of tasks and returns an action for each task.

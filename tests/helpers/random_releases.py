@@ -1,4 +1,4 @@
-"""Write releases of random play, simulated by the rules in NumPy: states and rewards are valid, nobody learns."""
+"""Write releases of random play, simulated by the NumPy rules: states and rewards are valid, but no agent learns."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def random_history(layout: Layout, episodes: int, length: int, rng: np.random.Ge
 
 
 def make_tasks(layouts: list[str], teammates: int = 1, recipes: Sequence[Dish] | None = None) -> list[Task]:
-    """Return tasks with different heuristic teammates; the split is train if train has the layout, else test."""
+    """Return tasks with different heuristic teammates; on training layouts the split is train, on others test."""
     return [
         make_task(
             track_of(layout),

@@ -248,7 +248,7 @@ def test_user_packages_with_equal_folder_names_do_not_break_commands(bare_enviro
 
 
 def test_extras_named_in_messages_allow_training_and_drawing(jax_environment, wheel, tmp_path):
-    """The extra `jax` is enough to train and evaluate models; the install command in messages adds drawing."""
+    """The extra `jax` is enough to train and evaluate models; the install command that messages give adds drawing."""
     run = command_runner(jax_environment, tmp_path)
     run("python", "-c", EVALUATE)
     assert "ad-reference" in run("icrl4aht-data", "models")

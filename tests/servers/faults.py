@@ -104,7 +104,7 @@ class Faults:
             self._rules.append(rule)
 
     def next(self, fault: Fault, times: int = 1, path: str = "*", method: str | None = "GET") -> None:
-        """Add a fault of the next `times` requests that match `path` and `method`.
+        """Add a fault for the next `times` requests that match `path` and `method`.
 
         The path is a pattern of fnmatch (`*` also matches `/`); the method None matches any method.
         """

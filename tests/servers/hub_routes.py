@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from tests.servers.faults import Request
 from tests.servers.http import Answer
-from tests.servers.hub_repos import LFS_SUFFIXES, File, HubState, Refusal, Repo, is_large
+from tests.servers.hub_repos import LFS_SUFFIXES, File, HubError, HubState, Repo, is_large
 
 REPO = r"/api/datasets/(?P<id>[^/]+/[^/]+)"
 AT = r"/(?P<revision>[^/]+)"
@@ -38,7 +38,7 @@ class HubRequest:
         """The repository named in the path; requests without the token do not find private repositories."""
         repo = self.hub.repo(self.names["id"])
         if repo.private and not self.authorized:
-            raise Refusal(401, "Repository not found", "RepoNotFound")
+            raise HubError(401, "Repository not found", "RepoNotFound")
         return repo
 
     @property
@@ -50,7 +50,7 @@ class HubRequest:
 
     def require_token(self) -> None:
         if not self.authorized:
-            raise Refusal(401, "Invalid username or password.")
+            raise HubError(401, "Invalid username or password.")
 
 
 Route = Callable[[HubRequest], Answer]
@@ -91,7 +91,7 @@ def resolve(call: HubRequest) -> Answer:
     commit, path = call.repo.resolve(call.names["revision"]), call.names["path"]
     headers = {"X-Repo-Commit": commit.oid}
     if path not in commit.files:
-        raise Refusal(404, "Entry not found", "EntryNotFound", headers)
+        raise HubError(404, "Entry not found", "EntryNotFound", headers)
     file = commit.files[path]
     if not file.lfs:
         return Answer(call.hub.blobs.path(file.sha256), headers=headers | {"ETag": f'"{file.oid}"'})
@@ -154,7 +154,7 @@ def commit(call: HubRequest) -> Answer:
         operation = json.loads(line)
         if operation["key"] == "header":
             if not head.oid.startswith(operation["value"].get("parentCommit") or ""):
-                raise Refusal(412, "A commit has happened since. Please refresh and try again.")
+                raise HubError(412, "A commit has happened since. Please refresh and try again.")
         else:
             _apply(call.hub, files, operation["key"], operation["value"])
     oid = repo.commit(branch, files).oid
@@ -177,7 +177,7 @@ def new_tag(call: HubRequest) -> Answer:
     call.require_token()
     repo, name = call.repo, call.json()["tag"]
     if name in repo.tags:
-        raise Refusal(409, f"Reference already exists: {name}")
+        raise HubError(409, f"Reference already exists: {name}")
     repo.tags[name] = repo.resolve(call.names["revision"]).oid
     return json_answer({})
 

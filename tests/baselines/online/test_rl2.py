@@ -246,7 +246,7 @@ class TestTaskGroups:
 
 
 def played_actions(mates: list[Policy]) -> list[np.ndarray]:
-    """Return 40 actions of each teammate in the start state of an episode."""
+    """Return 40 actions of each teammate, all chosen in the start state of an episode."""
     cells, facings = np.array(LAYOUT.agent_cells, np.uint8), np.zeros(2, np.uint8)
     record = jnp.asarray(start_record(LAYOUT, cells, facings, LAYOUT.recipe_items[0]))
     act = jax.jit(mates[0].act)

@@ -30,5 +30,5 @@ def empty_responses(response_files) -> Iterator[None]:
 
 @pytest.fixture
 def invented_responses(empty_responses, response_files, monkeypatch) -> None:
-    """Replace the package's best responses with the invented ones that `write_measured` writes."""
+    """Replace the package's best responses with the invented ones that `write_invented_responses` writes."""
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: response_files / "measured.json")

@@ -122,7 +122,7 @@ def unload_library(library: str) -> None:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_loggers_of_a_resumed_run_have_every_line_once(tmp_path, name, offline, capfd):
+def test_loggers_of_a_resumed_run_store_each_line_exactly_once(tmp_path, name, offline, capfd):
     pytest.importorskip("tensorboardX" if name == "tensorboard" else name)
     unload_library("trackio")
     run = tmp_path / "ad-run"
@@ -144,7 +144,7 @@ def test_loggers_of_a_resumed_run_have_every_line_once(tmp_path, name, offline, 
 
 
 def log_two_runs(folder: Path) -> None:
-    """Write two runs with trackio in this process."""
+    """Log two runs with trackio in this process."""
     pytest.importorskip("trackio")
     unload_library("trackio")
     for run in ("one", "two"):

@@ -15,7 +15,7 @@ from icrl4aht_data.errors import NotStoredError, OptionError
 
 @pytest.fixture
 def dataset(two_sources) -> Dataset:
-    """Return the noise histories of demo_wide in split train, with two teammates."""
+    """Return the histories of source `noise` on demo_wide in split `train`, with two teammates."""
     return load_icrl4aht(two_sources[0], split="train", layout="demo_wide", source="noise")
 
 

@@ -58,7 +58,7 @@ def assert_page_embeds(page: bytes, dataset, shown: int | None = None) -> None:
         assert len(decoded) == (len(ends) if shown is None else min(shown, len(ends)))
         assert {0, len(ends) - 1} <= set(decoded)
         names = {"state", "rewards", "actions", "teammate_actions", "expert_actions"}
-        # The expert of a noise history is the oracle, so the page stores these labels only once.
+        # The expert of a noise history is the oracle, so the page stores one copy of the labels.
         apart = history.entry.has_oracle_actions and history.entry.source != "noise"
         names |= {"oracle_actions"} if apart else set()
         arrays = {name: history.read(name) for name in names}

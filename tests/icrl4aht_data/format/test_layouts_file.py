@@ -77,7 +77,7 @@ class TestReleaseWithLayouts:
         assert verify_release(root, level="deep").ok
 
     def test_commands_accept_names_of_release_layouts(self, root):
-        """Commands know the names of the package's layouts, and the names of a release's layouts after reading it."""
+        """Commands always know the package's layouts, and know the layouts of a release after reading the release."""
         printed = run_cli("list", root, "--layout", "mine-3-5")
         assert "mine-3-5" in printed and "coord_simple" not in printed
         with pytest.raises(UnknownNameError, match="unknown layout 'nowhere'"):

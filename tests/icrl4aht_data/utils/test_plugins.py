@@ -1,4 +1,4 @@
-"""Test that plugins registered by entry points are found by name and imported on demand, and errors of broken ones."""
+"""Test plugins registered by entry points: lookup by name, import on demand, and errors of broken plugins."""
 
 from __future__ import annotations
 

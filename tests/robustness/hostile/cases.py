@@ -99,7 +99,7 @@ def deep_json(levels: int) -> Make:
 
 
 def change_json(name: str, change: Callable[[Any], Any]) -> Spoil:
-    """Return a function that changes the content of a JSON file, in place or to the result of `change`."""
+    """Return a function that applies `change` to the content of a JSON file, in place or with a new value as result."""
 
     def rewrite_json(root: Path) -> None:
         value = json.loads((root / name).read_text())
@@ -110,7 +110,7 @@ def change_json(name: str, change: Callable[[Any], Any]) -> Spoil:
 
 
 def change_lines(change: Callable[[list[dict[str, Any]]], list | None], name: str = HISTORIES) -> Spoil:
-    """Return a function that changes the lines of a JSONL file, in place or to the result of `change`."""
+    """Return a function that applies `change` to the lines of a JSONL file, in place or with new lines as result."""
 
     def rewrite_lines(root: Path) -> None:
         values = [json.loads(line) for line in (root / name).read_text().splitlines()]
@@ -149,7 +149,7 @@ def set_theta(**changes: Any) -> Spoil:
 
 
 def change_table(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
-    """Return a function that changes the chunk table of the shard, in place or to the result of `change`."""
+    """Return a function that applies `change` to the shard's chunk table, in place or with a new table as result."""
 
     def rewrite_table(root: Path) -> None:
         rows = np.load(root / TABLE)
