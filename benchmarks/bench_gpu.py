@@ -297,7 +297,7 @@ def measure_attention(sizes: Sizes) -> dict[str, Any]:
 
     The implementations are that of our models, JAX's `dot_product_attention`, and the same function with cuDNN.
     """
-    small = SIZES["small"]
+    small = ModelOptions(**SIZES["small"].model)
     shape = (sizes.batch, sizes.length, small.heads, small.width // small.heads)
     q, k, v = jax.random.normal(jax.random.key(0), (3, *shape), jnp.bfloat16)
     library = partial(jax.nn.dot_product_attention, is_causal=True)
@@ -343,7 +343,7 @@ def ad_method(model: ModelOptions, layouts: Sequence[Layout]) -> Method:
 
 def context_length(sizes: Sizes, size: str) -> int:
     """Return AD's window length, which is L in training and K in acting, for the name of a model size."""
-    return min(sizes.length, SIZES[size].context)
+    return min(sizes.length, SIZES[size].train["context"])
 
 
 def short_message(error: BaseException) -> str:
