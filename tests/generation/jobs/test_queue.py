@@ -115,7 +115,7 @@ def test_training_stopped_error_can_be_pickled():
     assert (stopped.code, str(stopped)) == (143, "saved")
 
 
-def test_jobs_of_a_rebuild_have_unique_names_and_numbers_of_updates(tmp_path):
+def test_jobs_of_a_rebuild_have_unique_names_and_positive_numbers_of_updates(tmp_path):
     profile = load_profile("smoke")
     populations = population_runs(profile, {"demo_wide": ["fcp"]}, 0)
     jobs = [CollectionJob(work, profile, tmp_path) for work in profile.units()]
