@@ -73,7 +73,7 @@ _FIRST_EPISODES = 5
 _TRAINING: dict[str, Any] = {"learning_rate": 2e-3, "validate_every": 10**6, "save_every": 10**6, "log_every": 20}
 
 
-def validation_tasks() -> dict[str, tuple[Task, ...]]:
+def proof_tasks() -> dict[str, tuple[Task, ...]]:
     """Return the validation tasks that have headroom, of the tracks preference and teammate."""
     played = [*bundled_tasks(TEAMMATE_TRACK, "validation"), *bundled_tasks(TEAMMATE_TRACK, "diverse")]
     return {PREFERENCE: tuple(bundled_tasks(PREFERENCE, "validation")), TEAMMATE_TRACK: tuple(with_headroom(played))}
@@ -95,7 +95,7 @@ class ProofOptions:
     steps: int = 4000
     batch_size: int = 16
     context: int = 500
-    tasks: dict[str, tuple[Task, ...]] = field(default_factory=validation_tasks)
+    tasks: dict[str, tuple[Task, ...]] = field(default_factory=proof_tasks)
 
     @property
     def steps_per_update(self) -> int:
