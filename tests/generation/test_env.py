@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.padded import padded_layout
+from icrl4aht_generation.layouts.rearranged import with_four_recipes
 
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import INTERACT, STAY
@@ -223,10 +224,9 @@ def test_recipe_changes_only_after_correct_deliveries(batch_steps):
         assert 0.4 < changed < 0.6 if correct else changed == 0
 
 
-def test_custom_recipes_are_drawn_at_starts_and_after_deliveries():
-    four = Compiled.jit(Environment(CRAMPED, max_steps=MAX_STEPS, recipes=FOUR_RECIPES))
-    np.testing.assert_array_equal(four.env.recipe_items, FOUR_RECIPES)
-    np.testing.assert_array_equal(Environment(CRAMPED).recipe_items, [3 * ZERO, 3 * ONE])
+def test_other_recipes_are_drawn_at_starts_and_after_deliveries():
+    four = Compiled.jit(Environment(with_four_recipes(CRAMPED), max_steps=MAX_STEPS))
+    np.testing.assert_array_equal(four.env.tables.recipes, FOUR_RECIPES)
     started = fields(CRAMPED, four.init(some_keys(4)).record).recipe
     assert set(np.unique(started)) == set(FOUR_RECIPES.tolist())
     assert_uniform(started, 4)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from icrl4aht_generation.collection import curate
-from icrl4aht_generation.collection.task_folder import HistoryArrays, array_shapes, record_rollout
+from icrl4aht_generation.collection.task_folder import array_shapes, record_rollout
 from icrl4aht_generation.learners.config import PPOConfig, Widths
 from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.rollout import Rollout
@@ -26,9 +26,9 @@ ENVS = 3
 UNTOUCHED = 99  # a value that recorded arrays of these tests never contain
 
 
-def empty_histories(config: PPOConfig) -> HistoryArrays:
+def empty_histories(config: PPOConfig) -> dict[str, np.ndarray]:
     shapes = array_shapes(LAYOUT, config.environments, config.episodes)
-    return HistoryArrays(**{name: np.full(shape, UNTOUCHED, dtype) for name, (shape, dtype) in shapes.items()})
+    return {name: np.full(shape, UNTOUCHED, dtype) for name, (shape, dtype) in shapes.items()}
 
 
 def random_rollout(length: int, rng: np.random.Generator) -> Rollout:
@@ -42,7 +42,7 @@ def random_rollout(length: int, rng: np.random.Generator) -> Rollout:
     return Rollout(**fields, **rest)
 
 
-def record_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
+def record_by_loop(rollouts: list[Rollout], config: PPOConfig) -> dict[str, np.ndarray]:
     """Record the first 100 of each 400 steps, and the state after them, in a loop over steps."""
     kept = empty_histories(config)
     for update, rollout in enumerate(rollouts):
@@ -53,12 +53,12 @@ def record_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
                     continue
                 if clock < 100:
                     row = episode * 100 + clock
-                    kept.state[n, row] = rollout.record[t, n]
-                    kept.actions[n, row] = rollout.actions[t, n, 0]
-                    kept.teammate_actions[n, row] = rollout.actions[t, n, 1]
-                    kept.rewards[n, row] = rollout.reward[t, n]
+                    kept["state"][n, row] = rollout.record[t, n]
+                    kept["actions"][n, row] = rollout.actions[t, n, 0]
+                    kept["teammate_actions"][n, row] = rollout.actions[t, n, 1]
+                    kept["rewards"][n, row] = rollout.reward[t, n]
                 elif clock == 100:
-                    kept.episode_end_state[n, episode] = rollout.record[t, n]
+                    kept["episode_end_state"][n, episode] = rollout.record[t, n]
     return kept
 
 
@@ -73,10 +73,10 @@ def test_recorded_arrays_equal_those_of_a_loop_over_steps(length, updates):
     found = empty_histories(config)
     for number in (*reversed(range(updates)), *range(updates)):  # backwards, then once more forwards
         record_rollout(found, number, rollouts[number])
-    for name, array in expected._asdict().items():
+    for name, array in expected.items():
         assert array.size and not (array == UNTOUCHED).any(), name  # every entry was written
-        np.testing.assert_array_equal(getattr(found, name), array, err_msg=name)
-        assert getattr(found, name).dtype == array.dtype
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+        assert found[name].dtype == array.dtype
 
 
 def rewards_with_returns(returns: list[list[int]]) -> np.ndarray:

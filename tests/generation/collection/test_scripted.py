@@ -124,10 +124,10 @@ def test_episode_depends_only_on_seed_history_and_episode_number(arrays):
     found = play(7)
     for k in range(2):
         steps = slice(100 * episode[k], 100 * episode[k] + 100)
-        np.testing.assert_array_equal(np.asarray(found.state)[k], arrays["state"][history[k], steps])
-        np.testing.assert_array_equal(np.asarray(found.actions)[k], arrays["actions"][history[k], steps])
+        np.testing.assert_array_equal(np.asarray(found["state"])[k], arrays["state"][history[k], steps])
+        np.testing.assert_array_equal(np.asarray(found["actions"])[k], arrays["actions"][history[k], steps])
     other = play(8)
-    assert not np.array_equal(np.asarray(other.state)[0], np.asarray(found.state)[0])
+    assert not np.array_equal(np.asarray(other["state"])[0], np.asarray(found["state"])[0])
 
 
 def test_noise_schedules_follow_their_settings():

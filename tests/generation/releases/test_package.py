@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from icrl4aht_generation.collection.curate import oracle_labels
-from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA, HistoryArrays
+from icrl4aht_generation.collection.task_folder import HISTORY_ARRAYS, LABELLER_RETURNS, METADATA
 from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.releases import measures
 from icrl4aht_generation.releases.measures import TeammateFacts, teammate_facts, unusable_families
@@ -48,7 +48,7 @@ def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequenc
     """
     folder = artefacts / work.name
     shutil.copytree(artefact(built / "a"), folder)
-    arrays = {name: np.load(folder / f"{name}.npy") for name in HistoryArrays._fields}
+    arrays = {name: np.load(folder / f"{name}.npy") for name in HISTORY_ARRAYS}
     for name, array in arrays.items():
         np.save(folder / f"{name}.npy", np.concatenate([array, array], axis=1))
     rewards = np.zeros((8, 10, 100), np.int8)
@@ -63,7 +63,7 @@ def make_noise(built: Path, work: Work, artefacts: Path) -> None:
     """Write the artefact of a task with two noise histories."""
     source, folder = artefact(built / "a"), artefacts / work.name
     folder.mkdir(parents=True)
-    for name in HistoryArrays._fields:
+    for name in HISTORY_ARRAYS:
         np.save(folder / f"{name}.npy", np.load(source / f"{name}.npy")[:2])
     np.save(folder / "script_actions.npy", np.arange(1000).reshape(2, 500).astype(np.int8) % 6)
     metadata = json.loads((source / METADATA).read_text())
