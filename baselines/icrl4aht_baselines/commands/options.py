@@ -191,7 +191,7 @@ def prepare_training(
         played = job.about["histories"]
         text = (
             f"{method}: layers {sized.recurrent_layers}, width {sized.width}, encoder {sized.encoder}, steps "
-            f"{options.steps}, each an episode of {job.trainer.tasks} tasks\nplaying on "
+            f"{options.steps}, each an episode of {len(job.trainer.tasks)} tasks\nplaying on "
             f"{', '.join(played['layouts'])}, canonical channels, with the teammates of {len(played['groups'])} "
             f"families and layouts"
         )
