@@ -36,7 +36,7 @@ _LARGEST = 2 * 10**6  # maximum size of a bundled model's parameters, in bytes
 
 
 class BundledModel(NamedTuple):
-    """A bundled model.
+    """A trained model that is part of this package, with one run folder for each of its tracks.
 
     Attributes:
         name: name of the model, such as "ad-reference".
@@ -54,7 +54,7 @@ class BundledModel(NamedTuple):
 
 
 def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
-    """Return name -> bundled model."""
+    """Return the models in a folder of bundled models: name -> model."""
     found = {}
     for path in sorted(folder.glob("*/")):
         runs = {track: path / track for track in TRACKS if (path / track / CONFIG).is_file()}
@@ -80,13 +80,13 @@ def describe_model(model: BundledModel) -> list[str]:
 
 
 def check_bundle_name(name: str) -> None:
-    """Check that a name for a bundled model consists of small letters, digits and hyphens.
+    """Check that a bundled model's name is two or more words of lowercase letters and digits, joined by hyphens.
 
     Raises:
         OptionError: if the name has another form.
     """
     if not re.fullmatch("[a-z][a-z0-9]*(-[a-z0-9]+)+", name):
-        raise OptionError(f"name = {name!r}: expected words of small letters and digits with hyphens: ad-reference")
+        raise OptionError(f"name = {name!r}: expected lowercase words joined by hyphens, such as ad-reference")
 
 
 def bundle_run(
@@ -97,7 +97,7 @@ def bundle_run(
     Args:
         run: folder of the run.
         name: name of the bundled model.
-        track: track of the tasks that the run plays.
+        track: track of the tasks that the model plays.
         folder: folder of the bundled models.
         sampled: whether the model samples its actions by default, on all tracks.
         role: purpose of the model, such as "best of AD".
@@ -109,7 +109,7 @@ def bundle_run(
     trained, config = read_trained(run), read_config(run)
     steps = config["train"]["steps"]
     if trained.step < steps:
-        raise OptionError(f"{run}: stopped at step {trained.step} of {steps}; resume training with the same command")
+        raise OptionError(f"{run}: training stopped at step {trained.step} of {steps}; resume it with the same command")
     size = sum(4 * leaf.size for leaf in jax.tree.leaves(trained.params))
     if size > _LARGEST:
         raise OptionError(f"{run}: parameters of {size:,} bytes, expected at most {_LARGEST:,}: bundle a smaller model")

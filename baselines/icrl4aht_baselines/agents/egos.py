@@ -41,11 +41,11 @@ that was used, such as "ad-reference (sampled)"."""
 
 
 class PlayMode(NamedTuple):
-    """How a trained model computes its context and chooses its actions.
+    """Settings of a trained model that acts: how it computes its context and chooses its actions.
 
     Attributes:
         acting: how the context is computed, see `ACTING`.
-        greedy: whether the most probable action is taken, as in the paper, or an action is sampled.
+        greedy: True to take the most probable action, as in the paper; False to sample an action.
     """
 
     acting: Acting = "cached"
@@ -77,7 +77,7 @@ class NamedEgo(NamedTuple):
     run: Path | None = None
 
 
-def _stay(params: Any, carry: Any, view: Any, key: Any) -> tuple[Any, Any]:
+def _always_stay(params: Any, carry: Any, view: Any, key: Any) -> tuple[Any, Any]:
     return jnp.int32(STAY), carry
 
 
@@ -91,7 +91,7 @@ def _no_memory(params: Any, key: Any) -> tuple[()]:
 
 def stay(layout: Layout) -> Policy:
     """Return an ego that always takes the action "stay", to measure what the teammate earns without help."""
-    return Policy((), _no_memory, _stay, "situation")
+    return Policy((), _no_memory, _always_stay, "situation")
 
 
 def random(layout: Layout) -> Policy:
@@ -114,13 +114,13 @@ def agent_names() -> tuple[str, ...]:
 def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool | None = None) -> NamedEgo:
     """Return a reference ego, a bundled model, or the trained model in a run folder of `icrl4aht-data train`.
 
-    A bundled model has one set of parameters per track, and plays each layout with those of the layout's track.
+    A bundled model has one set of parameters per track, and plays a layout with the parameters of the layout's track.
 
     Args:
         name: name of a reference ego or of a bundled model, or path of a run folder.
         acting: how a trained model computes its context, see `ACTING`; "cached" by default.
-        greedy: whether a trained model takes its most probable action or samples one; by default as in the model's
-            stored results.
+        greedy: True if a trained model takes its most probable action, False if it samples an action; by default as in
+            the model's stored results.
 
     Raises:
         UnknownNameError: if the name or the value of `acting` is unknown.
@@ -135,7 +135,9 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
         hint = "A trained model is named by its folder, which `icrl4aht-data train` makes."
         raise UnknownNameError(f"{unknown('agent', name, agent_names())} {hint}")
     if model is None and not (Path(name) / CONFIG).is_file():
-        raise UnknownNameError(f"{name}: not a run: {CONFIG} is missing; `icrl4aht-data train` makes runs")
+        raise UnknownNameError(
+            f"{name}: expected a run folder, but {CONFIG} is missing; `icrl4aht-data train` makes one"
+        )
     own_greedy = model is None or not model.sampled
     mode = PlayMode(acting or "cached", own_greedy if greedy is None else greedy)
     suffix = "" if mode.greedy == own_greedy else f" ({OTHER_WAYS[not mode.greedy]})"
@@ -147,7 +149,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
     runs = {track: read_trained(folder) for track, folder in model.runs.items()}
     egos = {track: trained_ego(run, mode, str(model.runs[track])) for track, run in runs.items()}
 
-    def make(layout: Layout) -> Policy:
+    def make_ego(layout: Layout) -> Policy:
         track = track_of(layout.name)
         if track not in egos:
             raise OptionError(
@@ -158,7 +160,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
 
     details = {"model": name, "run": {track: run.hash for track, run in runs.items()}, **mode.details}
     details["trained_on"] = {track: run.trained_on for track, run in runs.items()}
-    return NamedEgo(name + suffix, make, details)
+    return NamedEgo(name + suffix, make_ego, details)
 
 
 def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Layout], Policy]:
@@ -169,16 +171,16 @@ def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Lay
     """
     policy = trained_policy(run.method, run.params, run.context, mode)
 
-    def make(layout: Layout) -> Policy:
+    def make_ego(layout: Layout) -> Policy:
         if run.channels == "own" and layout.obs_shape != run.obs_shape:
             raise OptionError(
                 f"{folder}: trained on {', '.join(run.layouts)} with observations {run.obs_shape}; "
                 f"{layout.name} has {layout.obs_shape}; choose tasks on layouts with the same observation "
                 f"shape, or train with --channels canonical"
             )
-        return with_view(policy, run.channels, layout.name in run.hide_recipe)
+        return with_channels(policy, run.channels, layout.name in run.hide_recipe)
 
-    return make
+    return make_ego
 
 
 def trained_policy(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLISHED) -> Policy:
@@ -203,23 +205,23 @@ def trained_policy(method: Method, params: Any, context: int, mode: PlayMode = A
     return Policy(params, lambda params, key: method.start(context, mode.acting == "cached"), act, "ego_input")
 
 
-def with_view(policy: Policy, channels: Channels, hide_recipe: bool = False) -> Policy:
+def with_channels(policy: Policy, channels: Channels, hide_recipe: bool = False) -> Policy:
     """Return a policy that receives observations with the given channels.
 
-    If two policies share their functions, the returned policies do too, so they share one compiled program.
+    Policies with equal functions are converted to policies with equal functions, which share one compiled program.
 
     Args:
         policy: policy for observations with these channels.
         channels: "own" for the channels of the layout, or "canonical" for those that all layouts share.
-        hide_recipe: whether recipe indicators look like counters; possible with canonical channels only.
+        hide_recipe: whether recipe indicators are observed as counters; possible with canonical channels only.
     """
     if channels == "own":
         return policy
-    return policy._replace(act=_act_without_recipe(policy.act) if hide_recipe else policy.act, sees="canonical_input")
+    return policy._replace(act=_hide_recipe(policy.act) if hide_recipe else policy.act, sees="canonical_input")
 
 
 @lru_cache(maxsize=16)
-def _act_without_recipe(act: Callable[..., Any]) -> Callable[..., Any]:
+def _hide_recipe(act: Callable[..., Any]) -> Callable[..., Any]:
     change = no_change()._replace(hidden=jnp.bool_(True))
 
     def act_without_recipe(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:

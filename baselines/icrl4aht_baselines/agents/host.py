@@ -17,9 +17,9 @@ from icrl4aht_data.overcooked.layouts import Layout
 
 
 class EgoInput(NamedTuple):
-    """Input of an ego with memory: its observation and the outcome of the previous step.
+    """Input of an ego with memory: the ego's observation, and the outcome of the previous step.
 
-    At the first step of an episode, the `prev_*` fields are of the last step of the previous episode, as in training.
+    At the first step of an episode, the `prev_*` fields describe the last step of the previous episode, as in training.
     At the first step of a task they are zero. A `HostAgent` receives arrays of B tasks, with a leading axis (B,).
 
     Attributes:
@@ -75,17 +75,18 @@ def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout]
             raise OptionError(f"agent = {agent!r:.100}: expected an object with the methods reset and act")
     check_choice("channels", channels, CHANNELS)
 
-    def make(layout: Layout) -> HostPolicy:
+    def make_policy(layout: Layout) -> HostPolicy:
         def init(params, keys):
             agent.reset(keys.shape[0])
             return ()
 
-        def call(*ego_input) -> np.ndarray:
+        def call_agent(*ego_input) -> np.ndarray:
             batch = len(ego_input[1])
             actions = np.asarray(agent.act(EgoInput(*map(np.array, ego_input))))
             if actions.shape != (batch,) or not np.issubdtype(actions.dtype, np.integer):
                 raise OptionError(
-                    f"the agent's act returned {actions.dtype} of shape {actions.shape}, expected integers ({batch},)"
+                    f"the agent's act returned {actions.dtype} of shape {actions.shape}, "
+                    f"expected integers of shape ({batch},)"
                 )
             return actions.astype(np.int32)
 
@@ -93,8 +94,8 @@ def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout]
             if channels == "canonical":
                 ego_input = ego_input._replace(obs=to_canonical(layout, ego_input.obs))
             shape = jax.ShapeDtypeStruct(keys.shape, jnp.int32)
-            return io_callback(call, shape, *ego_input, ordered=True), carry
+            return io_callback(call_agent, shape, *ego_input, ordered=True), carry
 
         return HostPolicy((), init, act, "ego_input")
 
-    return make
+    return make_policy

@@ -1,4 +1,4 @@
-"""Commands that run experiments: positive control, headroom, best responses, adaptation, and models of a release."""
+"""Commands that run experiments: positive control, headroom, best responses, adaptation, and training on a release."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ _Queued = tuple[Sequence[Any], Callable[[Path], Path], Callable[[Path], str]]
 
 
 def _queue_command(out: str, card: str) -> Callable[[Callable[..., _Queued]], Callable[..., None]]:
-    """Return a decorator for a command that trains in a queue of jobs, with the queue's options, --out and --bundle.
+    """Return a decorator for a command that trains in a queue of jobs. It adds --out, --bundle and the queue's options.
 
-    The command returns the jobs, a function that writes their results into a folder and returns the path of the file,
-    and a function that returns the table of the results in a folder. Results of finished jobs are written and printed
-    even if other jobs failed.
+    The decorated command returns the jobs and two functions. The first writes the jobs' results into a folder and
+    returns the path of the file. The second returns the results in a folder as a table. Results of finished jobs are
+    written and printed even if other jobs failed.
 
     Args:
         out: default folder of the training runs.
@@ -48,8 +48,8 @@ def _queue_command(out: str, card: str) -> Callable[[Callable[..., _Queued]], Ca
         @click.option("--out", type=Folder(), metavar="FOLDER", default=out, help="Write training runs here.")
         @click.option("--bundle", is_flag=True, help=f"Also update {card} of the package's cards.")
         @wraps(command)
-        def run(queue: dict[str, Any], out: Path, bundle: bool, **choice: Any) -> None:
-            options = read_queue_options(queue)  # sets variables that JAX reads at its first use
+        def run_queue(queue: dict[str, Any], out: Path, bundle: bool, **choice: Any) -> None:
+            options = read_queue_options(queue)  # sets environment variables, which JAX reads at its first use
             from icrl4aht_generation.jobs.queue import run_jobs
             from icrl4aht_generation.learners.resume import limit_xla_threads
             from rich.console import Console
@@ -64,7 +64,7 @@ def _queue_command(out: str, card: str) -> Callable[[Callable[..., _Queued]], Ca
                     console.print(f"wrote {write(folder)}")
                 click.echo(table(out))
 
-        return run
+        return run_queue
 
     return decorate
 
@@ -247,7 +247,7 @@ def adaptation_headroom_command(
 @click.option("--seeds", type=COUNT, default=3, help="Training runs of each model, with different seeds.")
 @_queue_command("runs/proof", PROOF_FILE)
 def proof_command(root: Any, histories: tuple[str, ...], learner: tuple[str, ...], seeds: int, out: Path) -> _Queued:
-    """Show what a release teaches.
+    """Show what models learn from a release.
 
     Trains small AD and DPT models on the release only, and evaluates them on validation tasks. On the track preference
     each model also plays with its memory cleared before each episode. On the track teammate the models are compared
@@ -261,7 +261,7 @@ def proof_command(root: Any, histories: tuple[str, ...], learner: tuple[str, ...
     jobs = [ProofJob(source, name, seed, chosen, out) for seed in range(seeds) for source, name in models]
     references = run_references(chosen, out)
 
-    def table(folder: Path) -> str:
+    def format_table(folder: Path) -> str:
         return proof_table(parse_json(read_text(folder / PROOF_FILE)))
 
-    return jobs, lambda folder: write_proof(jobs, references, folder / PROOF_FILE), table
+    return jobs, lambda folder: write_proof(jobs, references, folder / PROOF_FILE), format_table

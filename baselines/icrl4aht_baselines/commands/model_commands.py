@@ -84,8 +84,8 @@ def collect_command(
     """Record histories of an agent with a release's teammates.
 
     Writes a release of source agent: the agent's actions, its choices before noise as expert actions, and the scripted
-    oracle's choices as oracle actions. Oracle actions are left out where the release states that the oracle earns less
-    than the end of the histories. Histories with validation teammates are recorded as well.
+    oracle's choices as oracle actions. Oracle actions are left out where the release states that the oracle's return
+    is lower than the return at the end of the histories. Histories with validation teammates are recorded as well.
     """
     from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
@@ -144,8 +144,8 @@ def reference_command(
 ) -> None:
     """Make reference models, and the data that they are trained on.
 
-    Generates a release of noise histories, trains one model for each track, and evaluates it. Histories of a trained
-    agent, if a model learns from them, are recorded first. The same command resumes a stopped run. rl2-reference learns
+    Generates a release of noise histories, trains one model for each track, and evaluates it. If a model learns from
+    histories of a trained agent, they are recorded first. The same command resumes a stopped run. rl2-reference learns
     by playing with training teammates. ad-reference and dpt-reference learn from histories of rl2-reference, labelled
     with its choices. ad-rising imitates histories of rl2-reference that begin with random actions.
     """
@@ -160,9 +160,10 @@ def reference_command(
             raise click.UsageError(f"--bundle-as: {error}") from error
         if len(names) != 1 or {*track} != set(TRACKS) or not evaluates:
             raise click.UsageError(
-                "--bundle-as: expected one --name, all tracks and an evaluation, since the card states the results"
+                "--bundle-as: expected one --name, all tracks and an evaluation, whose results the card states; "
+                "leave out --track and --no-evaluate"
             )
-    if teacher:  # an invalid name is an error before hours of work
+    if teacher:  # reports an invalid name now, not after hours of work
         find_agent(teacher)
         for name in names:
             check_learns_from_teacher(name)
@@ -218,13 +219,13 @@ def _print_schema(context: click.Context, parameter: click.Parameter, wanted: bo
 def submit_command(
     folders: tuple[Path, ...], name: str, update: bool, out: Path, overwrite: bool, **facts: Any
 ) -> None:
-    """Make a file of results for the page of `results`.
+    """Make a file of results for the page that `results` writes.
 
-    Each FOLDER was written by `evaluate`, under the protocol seeded with seeds 0, 1 and 2. Together the folders must
-    hold all test tasks of a track, or of both tracks, and state what the agent was trained on. Several folders hold the
-    agent's tracks, or its training runs with different seeds. Results of `evaluate --controls` are included. Results
-    with a model's other way of choosing actions, such as `evaluate --sampled`, are shown in separate rows. A pull
-    request that adds the file puts the agent on the page; `icrl4aht-data results FILE` shows a preview.
+    Each FOLDER was written by `evaluate`, under the protocol `seeded`, with the seeds 0, 1 and 2. Together the folders
+    must hold all test tasks of a track, or of both tracks, and state what the agent was trained on. Give several
+    folders for tracks, or training runs, that were evaluated separately. Results of `evaluate --controls` are included.
+    Results with a model's other way of choosing actions, such as `evaluate --sampled`, are shown in separate rows. A
+    pull request that adds the file puts the agent on the page; `icrl4aht-data results FILE` shows a preview.
     """
     from icrl4aht_baselines.report import comparison, submission
 

@@ -250,7 +250,7 @@ def join_processes(coordinator: str | None, processes: int, process: int) -> Non
         raise click.UsageError(f"--coordinator {coordinator}: expected HOST:PORT, such as 10.0.0.1:6000")
     if not coordinator and (processes, process) != (1, 0):
         raise click.UsageError(
-            "--processes and --process: expected --coordinator HOST:PORT as well, equal in all processes"
+            "--processes and --process: expected --coordinator HOST:PORT as well, the same in all processes"
         )
     if process >= processes:
         raise click.UsageError(f"--process {process}: expected a number below {processes}")

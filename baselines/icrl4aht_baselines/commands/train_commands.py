@@ -86,7 +86,7 @@ def evaluate_command(
     from icrl4aht_baselines.agents.egos import find_agent
     from icrl4aht_baselines.evaluate.evaluator import evaluate_controls
     from icrl4aht_baselines.evaluate.protocols import CONTROLS, get_protocol, hidden_recipe_note, limit_tasks
-    from icrl4aht_baselines.evaluate.rollout import Programs
+    from icrl4aht_baselines.evaluate.rollout import ProgramCache
     from icrl4aht_baselines.report.page import summary_lines
     from icrl4aht_baselines.report.results import evaluate_agent, note_results
     from icrl4aht_baselines.report.scores import control_lines
@@ -100,7 +100,7 @@ def evaluate_command(
     rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
     if note := hidden_recipe_note(chosen):
         click.echo(note, err=True)
-    programs = Programs()
+    programs = ProgramCache()
     options: Any = {"seeds": seeds_of_tasks, "suite": suite, "out": out, "programs": programs}
     lines = []
     if controls:
@@ -108,7 +108,7 @@ def evaluate_command(
         lines = control_lines(played, chosen)
         for control in CONTROLS:
             note_results(out / control, ego.run, chosen)
-    # After controls, this only reads the results that are in `out`.
+    # With --controls, the results are in `out` already, so this call only reads them.
     run = evaluate_agent(ego, chosen, rules, control="cleared" if forget else None, **options)
     for line in [*summary_lines([run]), *lines]:
         click.echo(line)
@@ -271,7 +271,7 @@ def train_command(
     choice = replace_options(HistoryOptions(layouts, root and str(root)), histories)
     folder = out or Path("runs") / method
     if method in PLAYING and machines["processes"] > 1:
-        raise click.UsageError(f"--processes {machines['processes']}: {method} is trained by one process on one device")
+        raise click.UsageError(f"--processes: {method} is trained by one process on one device; leave out --processes")
     job, description = shared.prepare_training(method, size, model, train, play, choice, manifests)
     click.echo(description)
     params, steps = None if init is None else start_from(init, job.method, job.about), job.options.steps

@@ -17,7 +17,7 @@ VERBS = (
     _verb("train", "evaluate", _TRAIN, "Evaluate an agent on test tasks, or on validation tasks."),
     _verb("train", "report", _TRAIN, "Compare results with the paper's."),
     _verb("model", "results", _TRAIN, "Compare models on the benchmark's tasks."),
-    _verb("model", "submit", _TRAIN, "Make a file of results for the page of `results`."),
+    _verb("model", "submit", _TRAIN, "Make a file of results for the page that `results` writes."),
     _verb("model", "models", _TRAIN, "List the bundled models."),
     _verb("train", "watch", _TRAIN, "Play an episode and draw it as a GIF."),
     _verb("play", "play", _TRAIN, "Play on a web page with a policy or a person."),
@@ -26,6 +26,6 @@ VERBS = (
     _verb("experiment", "adaptation-headroom", _TRAIN, "Estimate what memory across episodes can earn."),
     _verb("experiment", "control", _TRAIN, "Check that AD and DPT adapt in context."),
     _verb("model", "research reference", _CHECKS, "Make reference models, and the data that they are trained on."),
-    _verb("experiment", "research proof", _CHECKS, "Show what a release teaches."),
+    _verb("experiment", "research proof", _CHECKS, "Show what models learn from a release."),
     _verb("experiment", "research headroom", _CHECKS, "Measure the reference egos on every test task."),
 )

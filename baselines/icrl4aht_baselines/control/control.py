@@ -77,7 +77,9 @@ class ControlCheck(NamedTuple):
 
 
 def run_control(folder: Path, show: Callable[..., None], size: ControlSize | None = None) -> list[ControlCheck]:
-    """Train and evaluate all three models, or resume a stopped run of the same size. Return the checks.
+    """Train and evaluate the three models of the positive control, and return the checks.
+
+    A stopped run of the same size is resumed.
 
     Args:
         folder: folder of the training runs.
@@ -156,18 +158,18 @@ def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list
     held_out, known = goals[2::5], np.delete(goals, np.s_[2::5])  # held-out goals are spread over the grid
     method = ad(DARK_ROOM_MODEL, small.world)
 
-    def histories(count: int, some: np.ndarray) -> Any:
-        cells, actions, rewards = worlds.search(rng.choice(some, count), size.room_episodes, rng)
+    def make_histories(count: int, some: np.ndarray) -> Any:
+        cells, actions, rewards = worlds.search_histories(rng.choice(some, count), size.room_episodes, rng)
         return worlds.ad_rows(worlds.CELL_OBS[cells], actions, rewards, small.episode)
 
-    rows = [histories(size.rows, known), histories(512, held_out)]
+    rows = [make_histories(size.rows, known), make_histories(512, held_out)]
     state = _train(method, rows, size, 2, folder, done)
     tasks = np.resize(held_out, size.tasks)
     best = worlds.best_return(tasks)
     steps = size.room_episodes * small.episode
 
     def share_of_best(context: int) -> np.ndarray:
-        """Return the mean of return / best possible return in each episode, (episodes,)."""
+        """Return the mean ratio of the return to the best possible return in each episode, float (episodes,)."""
         policy = trained_policy(method, state.params, context, PlayMode(greedy=False))
         _, rewards = worlds.play_world(small, policy, jnp.asarray(tasks, jnp.int32), 0, steps)
         returns = np.asarray(rewards).reshape(len(tasks), -1, small.episode).sum(axis=-1)

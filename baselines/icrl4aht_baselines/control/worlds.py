@@ -90,7 +90,7 @@ NEXT_CELLS = (_TO[..., 0] * SIDE + _TO[..., 1]).astype(np.int32)
 
 
 def dark_room() -> SmallWorld:
-    """Return Dark Room: a task is the number of the goal's grid cell, int32 (); a step that ends there earns 1."""
+    """Return the environment Dark Room: a task is the goal's grid cell, int32 (); a step that ends there earns 1."""
     next_cells = jnp.asarray(NEXT_CELLS)
 
     def step(goal: Array, cell: Array, action: Array, key: Array) -> tuple[Array, Array]:
@@ -130,7 +130,7 @@ def play_world(
 
 
 class RowSampler:
-    """Sampler for the trainer that samples from fixed rows; batch i is a function of (seed, i)."""
+    """Sampler that draws training batches from fixed rows of data; batch i is a function of (seed, i)."""
 
     def __init__(self, rows: ADBatch | DPTBatch, batch_size: int, seed: int = 0) -> None:
         self.rows, self.batch_size, self.seed = rows, batch_size, seed
@@ -141,7 +141,7 @@ class RowSampler:
         return jax.tree.map(lambda array: array[chosen], self.rows)
 
     def empty(self) -> Any:
-        """Return a batch as a template for the shapes and dtypes of all batches."""
+        """Return a batch that shows the shapes and dtypes of all batches."""
         return self.batch(0)
 
 
@@ -177,7 +177,9 @@ def play_bandits(
     return np.stack(actions, axis=1).astype(np.int32), np.stack(rewards, axis=1).astype(np.float32)
 
 
-def search(goals: np.ndarray, episodes: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def search_histories(
+    goals: np.ndarray, episodes: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Dark Room histories of a learner that finds the goal: positions, actions (int32), rewards (float32).
 
     The arrays have shape (N, T). The learner walks between random grid cells until it is rewarded, and from then on

@@ -42,7 +42,7 @@ from icrl4aht_baselines.evaluate.rollout import (
     EpisodeBatch,
     EpisodeProgram,
     EvaluationRollout,
-    Programs,
+    ProgramCache,
     RolloutState,
     task_key,
 )
@@ -71,7 +71,7 @@ def evaluate(
     out: Path | None = None,
     details: dict[str, Any] | None = None,
     played: Callable[[int], None] | None = None,
-    programs: Programs | None = None,
+    programs: ProgramCache | None = None,
 ) -> list[Result]:
     """Evaluate an ego and return one result per task, in the order of `tasks`.
 
@@ -118,7 +118,7 @@ def evaluate(
     planned = plan_tasks(tasks, rules, control)
     results = {} if out is None else find_results(out, planned, settings)
     missing = [plan for plan in planned if plan.task.task_id not in results]
-    programs = Programs() if programs is None else programs
+    programs = ProgramCache() if programs is None else programs
     evaluation = _Evaluation(make_ego, rules, control, seeds, suite, settings, programs)
     with progress_bars(quiet=played is not None, unit="episodes") as show:
         played = played or counted(show, f"{agent}, {rules.name}", len(tasks) * len(seeds) * rules.episodes)
@@ -149,7 +149,7 @@ class _Evaluation:
     seeds: Sequence[int]
     suite: Path | None
     settings: dict[str, Any]
-    programs: Programs
+    programs: ProgramCache
 
     def play(self, planned: Sequence[PlannedTask], played: Callable[[int], None]) -> Iterator[Result]:
         """Yield the results of each group of tasks that share compiled programs, as soon as the group is finished."""
@@ -159,7 +159,7 @@ class _Evaluation:
         for plan in planned:
             groups[tuple(_program_key(task, egos[task.layout], self.make_ego) for task in plan.played)].append(plan)
         stopped, make = Event(), self.make_ego if self.make_ego in SCRIPTED else egos.__getitem__
-        # Groups run in parallel: one compiles while another plays, and a single group does not use all cores. An ego
+        # Groups run in parallel: one group compiles while another plays, and one alone does not use all cores. An ego
         # outside JAX needs a single thread, because the episodes of a group must directly follow its `reset`.
         outside = any(isinstance(ego, HostPolicy) for ego in egos.values())
         with ThreadPoolExecutor(1 if outside else min(4, usable_cores())) as pool:
@@ -250,7 +250,7 @@ def prepare_rollout(
     seeds: Sequence[int] = (0,),
     suite: Path | None = None,
     *,
-    programs: Programs | None = None,
+    programs: ProgramCache | None = None,
     earlier: PreparedRollout | None = None,
 ) -> PreparedRollout:
     """Compile the episodes of tasks that share a teammate family.
@@ -285,7 +285,7 @@ def prepare_rollout(
         before = earlier.rollout
         is_same = rollout.layout == before.layout and np.array_equal(rollout.numbers, before.numbers)  # type: ignore[arg-type]
         state = earlier.state if is_same else jax.jit(rollout.move_to_layouts)(earlier.state)
-    programs = Programs() if programs is None else programs
+    programs = ProgramCache() if programs is None else programs
     return PreparedRollout(rollout, state, programs.episode(rollout, state))
 
 
@@ -356,7 +356,7 @@ class ControlledResults(NamedTuple):
         plain: results of the ego without a control.
         cleared: results with the ego's memory cleared before each episode.
         swapped: results with another task's teammate in all episodes but the last ones.
-        last: number of the last episodes that the task's teammate plays under the control `swapped`.
+        last: number of episodes at the end of a task that the task's own teammate plays under the control `swapped`.
     """
 
     plain: list[Result]
@@ -366,12 +366,12 @@ class ControlledResults(NamedTuple):
 
     @property
     def memory(self) -> Float[np.ndarray, "U S"]:
-        """M: return minus the return with the memory cleared before each episode, as the mean over all episodes."""
+        """Benefit M of memory: mean return, minus the mean return with the memory cleared before each episode."""
         return (_return_array(self.plain) - _return_array(self.cleared)).mean(axis=-1)
 
     @property
     def partner(self) -> Float[np.ndarray, "U S"]:
-        """P: return in the last episodes minus the return in the same episodes after episodes with another teammate."""
+        """Benefit P of the right context: return in the last episodes, minus that after another teammate's episodes."""
         return (_return_array(self.plain) - _return_array(self.swapped))[..., -self.last :].mean(axis=-1)
 
 
@@ -403,7 +403,7 @@ def evaluate_controls(
     plan_tasks(tasks, rules, "swapped")  # reports a task without a partner now, not after hours
     # Only equal functions share compiled programs, and some `make_ego` return new functions in each call.
     make = make_ego if make_ego in SCRIPTED else cache(make_ego)
-    options = {"programs": Programs()} | options
+    options = {"programs": ProgramCache()} | options
     results = {
         control: evaluate(agent, make, tasks, rules, control=control, out=out and out / (control or ""), **options)
         for control in (None, *CONTROLS)

@@ -1,8 +1,8 @@
-"""Protocols of evaluations, choice of tasks, controls, and the segments that a task is played in.
+"""Protocols and controls of evaluations, the choice of tasks, and the segments that a task is played in.
 
 A segment is a sequence of episodes with the same teammate. An ego keeps its memory from one segment to the next and
-does not observe the change. The random keys of episodes depend on the task but not on the teammate, so the last
-episodes of a control differ from those of the evaluation without it only in the ego's memory.
+does not observe that the teammate changes. The random keys of episodes depend on the task but not on the teammate, so
+the last episodes of a control differ from those of the evaluation without it only in the ego's memory.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Protocol:
 
     @property
     def last_episodes(self) -> int:
-        """Number of episodes at the end of a task that show what the ego has learned: 20, or half of all if fewer."""
+        """Number of a task's last episodes, which show the ego's adaptation: 20, or half of all if that is less."""
         return max(1, min(LAST_EPISODES, self.episodes // 2))
 
 
@@ -129,7 +129,7 @@ def get_protocol(name: str, episodes: int | None = None) -> Protocol:
 def hidden_recipe_note(tasks: Sequence[Task]) -> str:
     """Return a sentence that names layouts on which observations do not show the ordered dish, or an empty string.
 
-    Layouts with a single recipe are not named, unless their tasks have a fixed dish, which is one of several.
+    A layout with a single recipe is named only if a task on the layout fixes the dish.
     """
     hidden = [task for task in tasks if not task.layout.shows_recipe]
     hidden = [task for task in hidden if len(task.layout.recipes) > 1 or task.recipes is not None]
@@ -193,9 +193,9 @@ def segment_lengths(protocol: Protocol, control: Control | None = None) -> tuple
 
 
 def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | None = None) -> list[PlannedTask]:
-    """Return the tasks with the teammate of each segment, which is that of the task or of a partner task.
+    """Return each task with the teammates of its segments, which come from the task itself or from partner tasks.
 
-    The partner task is on the same layout and of the next teammate family, in the order of `tasks`: the first task of a
+    A partner task is on the same layout and of the next teammate family, in the order of `tasks`: the first task of a
     family gets the first task of the next family, and so on. If all tasks are of one family, the partner is the next
     task with another teammate. Under the control `swapped`, the partner's teammate plays first. Under a protocol that
     swaps teammates, the task's teammate plays first, then that of its partner, then that of the partner's partner.
@@ -207,7 +207,7 @@ def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | Non
     if segments == 1:
         return [PlannedTask(task, (task,)) for task in tasks]
     by_layout = grouped(tasks, lambda task: task.layout.name)
-    partner = {task.task_id: _swap_partner(task, by_layout[task.layout.name]) for task in tasks}
+    partner = {task.task_id: _find_partner_task(task, by_layout[task.layout.name]) for task in tasks}
     planned = []
     for task in tasks:
         chain = [task]
@@ -220,16 +220,16 @@ def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | Non
     return planned
 
 
-def _swap_partner(task: Task, on_layout: Sequence[Task]) -> Task:
+def _find_partner_task(task: Task, on_layout: Sequence[Task]) -> Task:
     def has_other_dish(other: Task) -> bool:
-        # If a task fixes the dish, the ego does not see it, so the partner has to want another dish as well.
+        # The ego does not see a dish that the task fixes, so the partner task must fix another dish as well.
         return task.recipes is None or other.recipes != task.recipes
 
     ids = [other.task_id for other in on_layout]
     following = [*on_layout[ids.index(task.task_id) + 1 :], *on_layout[: ids.index(task.task_id)]]
     families = [other.teammate_family for other in following if has_other_dish(other)]
     if other_families := [family for family in families if family != task.teammate_family]:
-        # The partner has the same number in the next family, so that tasks of a family get different partners.
+        # The partner task has the same number in the next family, so that tasks of a family get different partners.
         partners = [one for one in on_layout if one.teammate_family == other_families[0] and has_other_dish(one)]
         own = [one.task_id for one in on_layout if one.teammate_family == task.teammate_family]
         return partners[own.index(task.task_id) % len(partners)]

@@ -47,11 +47,11 @@ def result_path(out: Path, task_id: str) -> Path:
 
 
 def find_results(out: Path, planned: Sequence[PlannedTask], settings: dict[str, Any]) -> dict[str, Result]:
-    """Return task id -> stored result, for those tasks that a folder of results has.
+    """Return task id -> stored result, for the planned tasks whose results are in a folder.
 
     Args:
         out: folder of results.
-        planned: tasks to find results of, with the partners that the results must have.
+        planned: tasks whose results are wanted, with the partners that the results must have.
         settings: settings that the results must have.
 
     Raises:
@@ -87,9 +87,9 @@ def read_result(path: Path) -> Result:
         digest = content.pop("settings_hash")
         result = Result(**content)
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
-        raise OptionError(f"{path}: not a result: {error!r}; remove it and evaluate again") from error
+        raise OptionError(f"{path}: not a result: {error!r}; remove the file and evaluate again") from error
     if digest != json_hash(result.settings):
-        raise OptionError(f"{path}: its settings do not match their hash; remove it and evaluate again")
+        raise OptionError(f"{path}: the settings do not match their hash; remove the file and evaluate again")
     return result
 
 

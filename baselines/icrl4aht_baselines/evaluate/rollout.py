@@ -26,7 +26,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, with_recipes
 
-EGO_STEPS, TEAMMATE_STEPS = 2, 3  # numbers of random key streams; 0 and 1 are those of the agents' memories
+EGO_STEPS, TEAMMATE_STEPS = 2, 3  # numbers of random key streams; streams 0 and 1 are for the agents' memories
 
 
 class RolloutState(NamedTuple):
@@ -167,7 +167,7 @@ def _protocol_layout(layout: Layout, protocol: Protocol) -> Layout:
 
 
 def no_outcome(batch: int) -> EgoInput:
-    """Return the outcome of the previous step for the first step of B tasks, which consists of zeros."""
+    """Return the input of B egos before the first step of a task: an outcome of zeros, without observations."""
     zero = jnp.zeros(batch, jnp.int32)
     return EgoInput(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
 
@@ -186,7 +186,7 @@ EpisodeProgram = Callable[..., tuple[RolloutState, EpisodeBatch]]
 """Type of a compiled `EvaluationRollout.episode`."""
 
 
-class Programs:
+class ProgramCache:
     """Cache of compiled episodes that several evaluations of an ego can share; `len` is the number of programs.
 
     The cache is thread-safe: each program is compiled once.
@@ -214,18 +214,18 @@ class Programs:
         policies = [(policy.init, policy.act, policy.sees) for policy in (rollout.ego, rollout.teammates[0])]
         layouts = rollout.layout if isinstance(rollout.layout, Layout) else tuple(rollout.layout)
         shapes = tuple((np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves)
-        rules = rollout.protocol.steps, rollout.protocol.four_recipes  # all other rules are in states and policies
+        rules = rollout.protocol.steps, rollout.protocol.four_recipes  # states and policies cover all other rules
         key = layouts, rules, *policies, structure, shapes
         with self._lock:
             lock = self._locks.setdefault(key, Lock())
-        with lock:  # other programs can be compiled at the same time
+        with lock:  # one lock per program, so that other programs compile at the same time
             if key not in self._found:
                 self._found[key] = _compile(rollout, arguments)
             return self._found[key]
 
 
 def _compile(rollout: EvaluationRollout, arguments: tuple[Any, Any, RolloutState]) -> EpisodeProgram:
-    """Compile an episode after checking the egos' actions by tracing one step, which computes nothing."""
+    """Compile an episode. The dtype and shape of the egos' actions are checked first, by tracing one step."""
     state = arguments[-1]
     keys = state.env.key
     actions, _ = jax.eval_shape(rollout.ego_actions, rollout.ego.params, state, keys)

@@ -35,7 +35,7 @@ from jaxtyping import Array, Float, Int, Int8
 from icrl4aht_baselines.agents.egos import NamedEgo
 from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import get_protocol, segment_lengths
-from icrl4aht_baselines.evaluate.rollout import Programs
+from icrl4aht_baselines.evaluate.rollout import ProgramCache
 from icrl4aht_baselines.online.teammates import tasks_on_layouts
 from icrl4aht_baselines.training.run_folder import check_same_settings
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
@@ -168,7 +168,7 @@ def record_histories(
 
     every = next((one.every for one in swaps.values()), None)
     protocol = replace(get_protocol("seeded", config.episodes), swap_every=every)
-    programs, prepared, parts = Programs(), None, list[tuple[np.ndarray, ...]]()
+    programs, prepared, parts = ProgramCache(), None, list[tuple[np.ndarray, ...]]()
     for length in segment_lengths(protocol):  # a segment has no change of teammates
         mates = [swaps[one.task_id].teammate(len(parts)) if one.task_id in swaps else one.teammate for one in tasks]
         playing = [replace(task, teammate=mate) for task, mate in zip(tasks, mates, strict=True)]

@@ -24,7 +24,7 @@ from icrl4aht_generation.teammates.spread import find_measured
 from msgspec import structs, to_builtins
 
 from icrl4aht_baselines.agents.bundled import bundled_models
-from icrl4aht_baselines.agents.egos import PlayMode, trained_policy, with_view
+from icrl4aht_baselines.agents.egos import PlayMode, trained_policy, with_channels
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
@@ -215,7 +215,9 @@ class ResponseJob(EgoJob):
         trainer, params = self.train([played] * self.options.tasks, on_update, params)
         modes = {}
         for mode, greedy in (("greedy", True), ("sampled", False)):
-            policy = with_view(trained_policy(trainer.method, params, KEPT_STEPS, PlayMode(greedy=greedy)), "canonical")
+            policy = with_channels(
+                trained_policy(trainer.method, params, KEPT_STEPS, PlayMode(greedy=greedy)), "canonical"
+            )
             choice, report = (self._mean_return(policy, seeds) for seeds in (CHOICE_SEEDS, REPORT_SEEDS))
             modes[mode] = {"choice": choice, "return": report}
         lines = map(parse_json, read_text(self.run_folder / METRICS).splitlines())

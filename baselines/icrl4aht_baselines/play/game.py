@@ -59,7 +59,7 @@ class PolicyPlayer:
 
     def __init__(self, policy: Policy, layout: Layout, slot: int, *, is_ego: bool) -> None:
         policy = on_layout(policy, layout) if policy.sees == "situation" else policy
-        self.policy = policy._replace(params=jax.device_put(policy.params))  # one transfer for all steps
+        self.policy = policy._replace(params=jax.device_put(policy.params))  # transferred once, not at every step
         self.layout, self.slot, self.is_ego, self._memory = layout, slot, is_ego, None
         act = self.policy.act
         self._act = jax.jit(lambda params, memory, view, key, t: act(params, memory, view, jax.random.fold_in(key, t)))
@@ -148,19 +148,19 @@ class Game:
         self.layout, self.key, self.episodes, self.steps = layout, key, episodes, steps
         env = Environment(layout, steps)
 
-        def begin(episode: jax.Array) -> Any:
+        def begin_episode(episode: jax.Array) -> Any:
             state = env.init(key[None])._replace(episode=episode[None])
             return env.first_record(state.key, state.episode)[0], env.episode_key(state)[0]
 
-        def draw(episode: jax.Array, clock: jax.Array) -> Any:
+        def draw_recipe(episode: jax.Array, clock: jax.Array) -> Any:
             empty = jnp.zeros((1, 0), jnp.uint8)
             return env.next_recipe(EnvState(key[None], episode[None], clock[None], empty))
 
-        self._begin_episode, self._draw_recipe = jax.jit(begin), jax.jit(draw)
+        self._begin_episode, self._draw_recipe = jax.jit(begin_episode), jax.jit(draw_recipe)
         self._restart(players)
 
     def with_players(self, players: Sequence[PolicyPlayer | None]) -> Game:
-        """Return a copy of this game before its first step, for other players."""
+        """Return a copy of this game that other players play from its first step."""
         other = copy(self)
         other._restart([copy(player) for player in players])
         return other

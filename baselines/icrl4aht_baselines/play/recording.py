@@ -42,7 +42,7 @@ def human_task(partner: Partner, seed: int) -> Task:
         seed: number of the game, 0 to `HUMAN_SEEDS` - 1, which determines the initial states of the episodes.
 
     Raises:
-        OptionError: if the partner is not a test teammate, which a release could not describe.
+        OptionError: if the partner is not a test teammate, because releases describe teammates by their parameters.
     """
     if partner.task is None:
         raise OptionError(
@@ -54,11 +54,11 @@ def human_task(partner: Partner, seed: int) -> Task:
 
 
 def check_pseudonym(pseudonym: object) -> str:
-    """Return the pseudonym, after a check that it is valid.
+    """Check that a pseudonym has a valid form, and return it.
 
     Raises:
-        OptionError: if it does not consist of 2 to 30 letters, digits, hyphens and underscores. An e-mail address is
-            refused by this rule.
+        OptionError: if the pseudonym does not consist of 2 to 30 letters, digits, hyphens and underscores. This rule
+            also excludes e-mail addresses.
     """
     if not isinstance(pseudonym, str) or not re.fullmatch(r"[\w-]{2,30}", pseudonym):
         raise OptionError(f"pseudonym {pseudonym!r:.60}: expected 2 to 30 letters, digits, hyphens and underscores")

@@ -129,7 +129,7 @@ class PlaySession:
     async def show(self) -> None:
         """Send the current state to all connected browsers."""
         for slot, connection in list(self._sockets.items()):
-            with suppress(RuntimeError, WebSocketDisconnect):  # a closed connection, which `connect` handles
+            with suppress(RuntimeError, WebSocketDisconnect):  # the connection is closed, which `connect` handles
                 await connection.send_json(self._frame_message(slot))
 
     # ---- steps of the game
@@ -139,7 +139,7 @@ class PlaySession:
         loop, due = asyncio.get_running_loop(), 0.0
         while not self.game.is_over:
             await self._moving.wait()
-            due = max(due + 1 / self.ticks, loop.time())  # after a late step, later steps keep the interval
+            due = max(due + 1 / self.ticks, loop.time())  # a late step delays all following steps
             await asyncio.sleep(due - loop.time())
             if self._moving.is_set():
                 await self.advance()
@@ -267,11 +267,11 @@ def make_app(session: PlaySession) -> Starlette:
     async def running(app: Starlette) -> AsyncIterator[None]:
         loop = asyncio.get_running_loop()
 
-        def changed() -> None:
+        def send_state() -> None:
             with suppress(RuntimeError):  # raised if the server has stopped
                 asyncio.run_coroutine_threadsafe(session.show(), loop)
 
-        Thread(target=session.compare, args=[changed], daemon=True).start()
+        Thread(target=session.compare, args=[send_state], daemon=True).start()
         task = asyncio.create_task(session.run()) if session.ticks else None
         yield
         if task:

@@ -22,18 +22,18 @@ from icrl4aht_baselines.report.results import (
     AgentReturns,
     ResultCell,
     as_run,
-    in_order,
     mean_of,
     returns_by_cell,
+    sorted_cells,
 )
 from icrl4aht_baselines.report.scores import (
     CellScales,
     add_scales,
     block_difference,
     cell_scales,
+    cells_with_headroom,
     find_score,
     known_headroom,
-    open_cells,
     score_difference,
 )
 from icrl4aht_baselines.report.statistics import MeanInterval, holm
@@ -110,12 +110,12 @@ def read_stored(path: Path) -> StoredResults:
         return StoredResults(frames[0][TABLE_COLUMNS], frames[1][CURVE_COLUMNS], agents)
     except (OSError, ValueError, KeyError) as error:
         raise OptionError(
-            f"{path}: not stored results: {error!r}; restore it, {table.name} and {curves.name}"
+            f"{path}: not stored results: {error!r}; restore this file, {table.name} and {curves.name}"
         ) from error
 
 
 def write_stored(path: Path, stored: StoredResults) -> None:
-    """Write results to a JSON file and to tables next to it, rounded to three digits, and curves to two."""
+    """Write results to a JSON file and two tables next to it. Results have three decimals, curves have two."""
     for file, frame, digits in zip(_table_paths(path), (stored.table, stored.curves), (3, 2), strict=True):
         with atomic_write(file) as partial:
             text = frame.round(digits).to_csv(index=False, lineterminator="\n")
@@ -125,10 +125,10 @@ def write_stored(path: Path, stored: StoredResults) -> None:
 
 
 def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
-    """Check that submitted results are of a new agent, or update the results of a stored agent.
+    """Check that a submission is an update if its agent is stored, and not an update otherwise.
 
     Raises:
-        OptionError: if neither is true; the message names the agent.
+        OptionError: if `Submission.update` is set for an agent that is not stored, or not set for a stored agent.
     """
     known = {agent.casefold(): agent for agent in stored.agents}.get(found.agent.casefold())
     if known and not found.update:
@@ -155,14 +155,14 @@ def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
         for episode, value in enumerate(np.concatenate(parts).mean(axis=0).tolist(), start=1)
     ]
 
-    def updated(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
+    def replace_rows(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
         is_replaced = (old["agent"] == found.agent) & (old["control"].isin(controls) | ("" in controls))
         return pd.concat([part for part in (old[~is_replaced], new) if len(part)], ignore_index=True)
 
     facts = found.facts if "" in controls else stored.agents[found.agent]
     return StoredResults(
-        updated(stored.table, pd.concat(tables, ignore_index=True)),
-        updated(stored.curves, pd.DataFrame(rows, columns=CURVE_COLUMNS)),
+        replace_rows(stored.table, pd.concat(tables, ignore_index=True)),
+        replace_rows(stored.curves, pd.DataFrame(rows, columns=CURVE_COLUMNS)),
         stored.agents | {found.agent: facts},
     )
 
@@ -193,7 +193,7 @@ def render_comparison(stored: StoredResults) -> str:
     scales, every = cell_scales(SUBMITTED_PROTOCOL), stored.returns()
     results = {agent: cells for agent, cells in every.items() if not stored.agents[agent].commit}
     overlaps = {name for cells in results.values() for returns in cells.values() for name in returns.overlaps}
-    measured, scored = read_best_responses(), open_cells(scales)
+    measured, scored = read_best_responses(), cells_with_headroom(scales)
     shown = stored.with_other_play_modes(results)
     one_way = [f"`{agent}`" for agent in results if not any(f"{agent} ({way})" in shown for way in OTHER_WAYS)]
     return fill_template(
@@ -203,7 +203,7 @@ def render_comparison(stored: StoredResults) -> str:
         difference=describe_lead(results, scales),
         controls=controls_table(stored, shown, scales),
         layouts=layouts_table(results, scales),
-        trainings=describe_trainings(),
+        trainings=describe_training_runs(),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
         earlier=", ".join(f"`{agent}`" for agent in every if agent not in results) or "none",
         marks="\n".join(f"* {text}" for text in overlap_legend(overlaps)),
@@ -240,7 +240,7 @@ def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], sca
             texts = [facts.data, facts.labels, ", ".join(filter(None, (facts.steps, hours))) or "–"]
         row = [f"`{agent}`{overlap_marks(marks)}", *texts]
         for track in TRACKS:
-            score = find_score(cells, open_cells(scales, track), scales)
+            score = find_score(cells, cells_with_headroom(scales, track), scales)
             row += [_format_interval(score and score.total), _format_interval(score and score.middle)]
         body.append(row)
     scored = [f"{name}, {track}" for track in TRACKS for name in ("N", "IQM")]
@@ -249,7 +249,7 @@ def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], sca
 
 def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return a sentence on the difference between the two agents with the highest score N on the track teammate."""
-    cells = open_cells(scales, "teammate")
+    cells = cells_with_headroom(scales, "teammate")
     scores = {agent: found.total.mean for agent, of in results.items() if (found := find_score(of, cells, scales))}
     if len(scores) < 2:
         return "No two models have a score on the track `teammate`."
@@ -262,11 +262,11 @@ def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 
 
 def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
-    """Return table 2: M, P and the mean return in blocks of episodes, with the rows of table 1.
+    """Return table 2: benefits M of memory and P of the right context, and mean returns in blocks of episodes.
 
-    Means are over the combinations of layout and family that have headroom, or over all that the agent played if none
-    is known to have headroom. M and P are bold if they are above 0 with a p-value below 0.05, corrected for all tests
-    in the table.
+    The rows are those of table 1. Means are over the combinations of layout and family that have headroom, or over all
+    that the agent played if none is known to have headroom. M and P are bold if they are above 0 with a p-value below
+    0.05, corrected for all tests in the table.
     """
     chosen = {agent: _controlled_cells(cells, scales) for agent, cells in results.items()}
     found = {
@@ -291,7 +291,7 @@ def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], s
 
 
 def _controlled_cells(cells: AgentReturns, scales: CellScales) -> list[ResultCell]:
-    return [cell for cell in open_cells(scales) if cell in cells] or [*cells]
+    return [cell for cell in cells_with_headroom(scales) if cell in cells] or [*cells]
 
 
 def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, str]:
@@ -301,7 +301,7 @@ def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, s
     for agent in agents:
         cells, cleared, texts = results.get(agent, {}), controls.get(agent, {}), []
         for track in TRACKS:
-            score = find_score(cells, open_cells(scales, track), scales)
+            score = find_score(cells, cells_with_headroom(scales, track), scales)
             texts.append(f"N {_format_interval(score and score.total)} on track {track}")
         memory = block_difference(cells, cleared, _controlled_cells(cells, scales), "all")
         texts.append(f"M {_format_interval(memory, 1, '+')}")
@@ -309,7 +309,7 @@ def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, s
     return found
 
 
-def mean_best(layout: str, scales: CellScales) -> float | None:
+def mean_best_return(layout: str, scales: CellScales) -> float | None:
     """Return the mean return of the best responses to the families of a layout; None if no family has one.
 
     For a family without a best response, the return of `stay` is used, because the oracle earns no more with this
@@ -324,14 +324,14 @@ def mean_best(layout: str, scales: CellScales) -> float | None:
 def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return table 3: mean return on each layout, with the score N in parentheses, worst teammate, and regret.
 
-    The first rows are of the reference egos and the best responses.
+    The first rows show the reference egos and the best responses.
     """
-    scored, headroom = open_cells(scales), read_headroom(SUBMITTED_PROTOCOL)
+    scored, headroom = cells_with_headroom(scales), read_headroom(SUBMITTED_PROTOCOL)
     body = []
     for ego in REFERENCES:
         means = (np.mean([egos[ego] for cell, egos in headroom.items() if cell[0] == name]) for name in TEST_LAYOUTS)
         body.append([f"`{ego}`", *(f"{mean:z.1f}" for mean in means), "", ""])
-    bests = [mean_best(name, scales) for name in TEST_LAYOUTS]
+    bests = [mean_best_return(name, scales) for name in TEST_LAYOUTS]
     body.append(["best response", *("–" if best is None else f"{best:z.1f}" for best in bests), "", ""])
     for agent, cells in results.items():
         texts = []
@@ -346,15 +346,18 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
     return markdown_table(["model", *TEST_LAYOUTS, "worst teammate", "regret"], body, right=len(TEST_LAYOUTS) + 2)
 
 
-def describe_trainings() -> str:
+def describe_training_runs() -> str:
     """Return sentences on how the best responses were trained, or an empty string if there are none."""
     behaviours = read_best_responses().behaviours
     trained = [training for one in behaviours for training in one.seeds]
     if not trained:
         return ""
-    steps, width = _span([one.steps for one in trained], ",d"), _span([one.width for one in trained], "d")
+    steps, width = (
+        _format_range([one.steps for one in trained], ",d"),
+        _format_range([one.width for one in trained], "d"),
+    )
     better = sum(not one.agent.startswith("best response") for one in behaviours)
-    runs = _span([len(one.seeds) for one in behaviours], "d")
+    runs = _format_range([len(one.seeds) for one in behaviours], "d")
     return (
         f"Each of {len(behaviours)} behaviours has a best response from {runs} training "
         f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. For {better} behaviours a stored "
@@ -362,7 +365,7 @@ def describe_trainings() -> str:
     )
 
 
-def _span(values: Sequence[int], form: str) -> str:
+def _format_range(values: Sequence[int], form: str) -> str:
     low, high = (format(limit, form) for limit in (min(values), max(values)))
     return low if low == high else f"{low} to {high}"
 
@@ -370,11 +373,11 @@ def _span(values: Sequence[int], form: str) -> str:
 def plot_comparison(stored: StoredResults, path: Path) -> None:
     """Plot the agents' return in each episode on a log axis, with dashed lines for cleared memory.
 
-    The panels are of the first layouts with headroom.
-    An agent without stored curves has a point at the first episode. Horizontal lines show `stay` and best responses.
+    Each of the first six layouts with headroom has a panel. An agent without stored curves has a point at the first
+    episode. Horizontal lines show `stay` and best responses.
     """
     scales, results, headroom = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), read_headroom(SUBMITTED_PROTOCOL)
-    cells = in_order(cell for cell, has_any in known_headroom(SUBMITTED_PROTOCOL).items() if has_any)
+    cells = sorted_cells(cell for cell, has_any in known_headroom(SUBMITTED_PROTOCOL).items() if has_any)
     layouts = list(dict.fromkeys(cell.layout for cell in cells))[:_PANELS]
     figure, grid = panel_grid(layouts, 3, (3.6, 3), "episode")
     shown = [agent for agent in results if not stored.agents[agent].commit]
@@ -394,7 +397,7 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
                 axes.plot([1], [mean_of(first)], "o", color=color, markersize=4, label=f"{agent}, first episode")
         stays = [egos["stay"] for cell, egos in headroom.items() if cell[0] == layout]
         axes.axhline(np.mean(stays), color="gray", linestyle=":", label="stay")
-        if (best := mean_best(layout, scales)) is not None:
+        if (best := mean_best_return(layout, scales)) is not None:
             axes.axhline(best, color="black", label="best response")
         axes.set_ylim(*return_limits(value for line in axes.lines for value in np.ravel(line.get_ydata())))
         axes.set_xscale("log")

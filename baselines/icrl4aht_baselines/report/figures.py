@@ -1,4 +1,4 @@
-"""Charts of the report's page as numbers, which the page's template draws: bar charts, and panels of curves.
+"""Bar charts and panels of curves for the report's page, as numbers from which the page's template draws them.
 
 Positions are in per cent of a chart's width and height, from its top left corner.
 """
@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_baselines.report.results import TASK_KINDS, EvaluationRun, ResultCell, family_title, in_order, mean_of
+from icrl4aht_baselines.report.results import TASK_KINDS, EvaluationRun, ResultCell, family_title, mean_of, sorted_cells
 from icrl4aht_baselines.report.scores import cell_scales, find_score, scored_cells
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.seen import overlap_marks
@@ -24,7 +24,7 @@ from icrl4aht_data.plotting import return_limits, running_mean
 SMOOTHING = 10
 """Largest number of episodes in a curve's running mean; shorter curves use a tenth of their episodes."""
 
-_SCORE_LIMITS = (-0.5, 1.5)  # other scores, which occur where the headroom is small, are clipped
+_SCORE_LIMITS = (-0.5, 1.5)  # scores beyond these limits, which occur where the headroom is small, are clipped
 _TICKS = 5
 _DRAWING = 1000  # units of a panel's width and height
 
@@ -61,8 +61,8 @@ class BarRow(NamedTuple):
 class Curve(NamedTuple):
     """Curve of one run, as path data of an SVG of 1000 x 1000 units.
 
-    `line` is the smoothed curve, `raw` the curve without smoothing, and `band` the range of the instances. `raw` and
-    `band` are empty if there is nothing to draw.
+    `line` is the smoothed curve, `raw` the curve without smoothing, and `band` the range over the tasks.
+    `raw` and `band` are empty if there is nothing to draw.
     """
 
     series: int
@@ -141,12 +141,12 @@ def _score_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
         }
         for number, run in runs.items()
     }
-    cells = in_order(cell for of_run in values.values() for cell in of_run)
+    cells = sorted_cells(cell for of_run in values.values() for cell in of_run)
     if not cells:
         return []
     ends = [found.mean for of_run in values.values() for found in of_run.values()]
     scale = _Scale(max(_SCORE_LIMITS[0], min(-0.05, *ends)), min(_SCORE_LIMITS[1], max(1.05, *ends)))
-    played = in_order(cell for run in runs.values() for cell in run.cells if cell.kind == "test")
+    played = sorted_cells(cell for run in runs.values() for cell in run.cells if cell.kind == "test")
     without = [f"{cell.layout} {cell.family}" for cell in played if cell not in cells]
     about = (
         "A bar runs from the return of an ego that stays to that of the agent, relative to the best response; next to "
@@ -170,17 +170,19 @@ def _bar_chart(
     """Return a chart with bars from 0 to each value; `ranges` has the returns at the ends of each scale, as text."""
     shown = {number: run for number, run in runs.items() if values[number]}
     bars: dict[str, list[BarRow]] = defaultdict(list)
-    cells = in_order(cell for of_run in values.values() for cell in of_run)
+    cells = sorted_cells(cell for of_run in values.values() for cell in of_run)
     for cell in cells:
         of_cell = {number: values[number][cell] for number in shown if cell in values[number]}
-        drawn = [_bar(number, shown[number], cell, found, scale, digits) for number, found in of_cell.items()]
+        drawn = [_make_bar(number, shown[number], cell, found, scale, digits) for number, found in of_cell.items()]
         bars[cell.layout].append(BarRow(family_title(cell.family), drawn, ranges.get(cell, "")))
     several = any(bar.interval for rows in bars.values() for row in rows for bar in row.bars)
     lines = ["Lines: 95 % intervals over the instances."] * several
-    return Chart(title, " ".join([*lines, about]).rstrip(), _series(shown, cells), scale.ticks(), bars=bars)
+    return Chart(title, " ".join([*lines, about]).rstrip(), _labelled_series(shown, cells), scale.ticks(), bars=bars)
 
 
-def _bar(number: int, run: EvaluationRun, cell: ResultCell, found: MeanInterval, scale: _Scale, digits: int) -> Bar:
+def _make_bar(
+    number: int, run: EvaluationRun, cell: ResultCell, found: MeanInterval, scale: _Scale, digits: int
+) -> Bar:
     returns = run.returns[cell]
     zero, end = scale.position(0), scale.position(found.mean)
     clipped = "" if scale.low <= found.mean <= scale.high else "*"
@@ -190,7 +192,7 @@ def _bar(number: int, run: EvaluationRun, cell: ResultCell, found: MeanInterval,
     return Bar(number, min(zero, end), abs(end - zero), interval, text, tooltip)
 
 
-def _series(runs: NumberedRuns, cells: Sequence[ResultCell]) -> list[tuple[int, str]]:
+def _labelled_series(runs: NumberedRuns, cells: Sequence[ResultCell]) -> list[tuple[int, str]]:
     return [
         (number, run.label + overlap_marks(run.overlaps(cell for cell in cells if cell in run.cells)))
         for number, run in runs.items()
@@ -223,7 +225,7 @@ def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) ->
     x = _Scale(1, max(2, episodes))
     panels = {
         cell.title: [
-            _curve(number, smooth[number, cell], raw[number, cell].mean(axis=0), x, y)
+            _make_curve(number, smooth[number, cell], raw[number, cell].mean(axis=0), x, y)
             for number in runs
             if (number, cell) in raw
         ]
@@ -231,23 +233,23 @@ def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) ->
     }
     x_ticks = [Tick(x.position(number), str(number)) for number in dict.fromkeys((1, (episodes + 1) // 2, episodes))]
     y_ticks = [Tick(round(100 - tick.position, 2), tick.label) for tick in y.ticks()]
-    return Chart(title, "", _series(runs, cells), x_ticks, y_ticks, panels=panels)
+    return Chart(title, "", _labelled_series(runs, cells), x_ticks, y_ticks, panels=panels)
 
 
-def _curve(number: int, smooth: np.ndarray, raw: np.ndarray, x: _Scale, y: _Scale) -> Curve:
+def _make_curve(number: int, smooth: np.ndarray, raw: np.ndarray, x: _Scale, y: _Scale) -> Curve:
     if len(raw) == 1:  # a line needs two points
         smooth, raw = smooth.repeat(2, axis=1), raw.repeat(2)
     episodes, mean = np.arange(1, len(raw) + 1), smooth.mean(axis=0)
     outline = np.concatenate([episodes, episodes[::-1]]), np.concatenate([smooth.min(axis=0), smooth.max(axis=0)[::-1]])
     return Curve(
         number,
-        _path(episodes, mean, x, y),
-        "" if np.array_equal(raw, mean) else _path(episodes, raw, x, y),
-        f"{_path(*outline, x, y)}Z" if len(smooth) > 1 else "",
+        _svg_path(episodes, mean, x, y),
+        "" if np.array_equal(raw, mean) else _svg_path(episodes, raw, x, y),
+        f"{_svg_path(*outline, x, y)}Z" if len(smooth) > 1 else "",
     )
 
 
-def _path(xs: np.ndarray, ys: np.ndarray, x: _Scale, y: _Scale) -> str:
+def _svg_path(xs: np.ndarray, ys: np.ndarray, x: _Scale, y: _Scale) -> str:
     """Return SVG path data for a line through points."""
     columns = np.rint((xs - x.low) / (x.high - x.low) * _DRAWING).astype(int)
     heights = np.rint((y.high - ys) / (y.high - y.low) * _DRAWING).astype(int)

@@ -44,7 +44,7 @@ class EpisodePair(NamedTuple):
     Attributes:
         cell: layout, family and kind of the task.
         title: text with agent, teammate and layout.
-        caption: text with the task and the overlap with training data, or the reason why there is no picture.
+        caption: text with the task and the overlap with training data, and the reason if episodes could not be drawn.
         episodes: first and last episode; only one if the task has one episode, none if the agent cannot be restored.
     """
 
@@ -65,10 +65,10 @@ def save_episodes(
     suite: Path | None = None,
     forget: bool = False,
 ) -> tuple[ShownEpisode, ...]:
-    """Play a task, and write some of its episodes as GIFs. Their returns are those that `evaluate` stores.
+    """Play a task, and write some of its episodes as GIFs. The returns equal those that `evaluate` stores.
 
     Args:
-        paths: number of an episode, from 1 -> path of its GIF. Episodes after the last of these are not played.
+        paths: number of an episode, from 1 -> path of its GIF. Episodes after the last one in `paths` are not played.
         task, make_ego, protocol, seed, suite, forget: see `evaluator.play_tasks`.
         cell: width and height of a map cell in pixels.
     """
@@ -132,7 +132,7 @@ def _draw_result(run: EvaluationRun, cell: ResultCell, prefix: Path, suite: Path
 
 
 def restore_ego(source: ResultSource) -> MakeEgo:
-    """Return the function from a layout to the policy that made some results.
+    """Return the ego that earned some results, as a function from a layout to the ego's policy.
 
     Raises:
         OptionError: if the results are of no reference ego and no trained model, or the model is missing or has
@@ -146,7 +146,7 @@ def restore_ego(source: ResultSource) -> MakeEgo:
     if folder is None:
         raise OptionError(f"{name} is neither a reference ego, nor a bundled model, nor a model with a run folder")
     if "model" not in details and not Path(folder).is_dir():
-        raise OptionError(f"its run folder {folder} is missing")
+        raise OptionError(f"the run folder {folder} of {name} is missing")
     agent = find_agent(folder, acting=details.get("acting"), greedy=not details.get("sampled"))
     if agent.details != details:
         raise OptionError(f"{folder} holds another model: expected {details} as in the results, found {agent.details}")

@@ -30,7 +30,7 @@ from icrl4aht_baselines.report.results import (
     EvaluationRun,
     ResultCell,
     family_title,
-    in_order,
+    sorted_cells,
 )
 from icrl4aht_baselines.report.scores import (
     add_scales,
@@ -122,7 +122,7 @@ def table_score(
 
 
 class ScoreTable(NamedTuple):
-    """Table of results in one kind of tasks.
+    """Table of results on one kind of tasks.
 
     Attributes:
         title: heading of the table.
@@ -142,7 +142,8 @@ class ScoreTable(NamedTuple):
 def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTable]:
     """Return a table of returns for each kind of tasks that was played.
 
-    Tables of test tasks also have averages, and under the paper's protocol rows of the paper's AD, DPT and `random`.
+    Tables of test tasks also have averages. Under the paper's protocol they have rows with the paper's results of AD,
+    DPT and `random`.
 
     Args:
         runs: results of agents under one protocol.
@@ -150,7 +151,7 @@ def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTa
     """
     tables = []
     for kind in TASK_KINDS:
-        cells = in_order(cell for run in runs for cell in run.cells if cell.kind == kind)
+        cells = sorted_cells(cell for run in runs for cell in run.cells if cell.kind == kind)
         if not cells:
             continue
         layouts = tuple(dict.fromkeys(cell.layout for cell in cells))
@@ -210,7 +211,7 @@ def published_score(agent: EvaluationRun | str, cells: Sequence[ResultCell]) -> 
 
 
 def describe_conditions(runs: Iterable[EvaluationRun], cells: Container[ResultCell] | None = None) -> str:
-    """Return a sentence with protocol, seeds, episodes and number of instances of some runs, or of their `cells`.
+    """Return a sentence with the protocol, seeds, episodes and number of tasks of some runs, or of their `cells`.
 
     If the conditions differ between runs, the sentence names the agents of each condition.
     """
@@ -300,7 +301,7 @@ def write_page(
     Args:
         runs: merged results of agents, see `results.merge`, under any protocols.
         path: path of the page; an existing file is replaced atomically.
-        gifs: whether the page has GIFs of episodes of at most three runs, of other agents before reference egos.
+        gifs: whether the page has GIFs of episodes. At most three runs have GIFs, reference egos only if there is room.
         suite: folder of learned teammates' checkpoints.
         progress: function for progress, called with (description, tasks drawn, number of tasks).
     """
@@ -310,7 +311,7 @@ def write_page(
     with TemporaryDirectory() as folder:
         episodes = family_gifs(shown, Path(folder), suite, progress)
         values = _page_values(runs, episodes, notes if shown and left else [])
-        text = _environment().get_template("page.html").render(values)
+        text = _template_environment().get_template("page.html").render(values)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")
@@ -318,7 +319,7 @@ def write_page(
 
 
 @cache
-def _environment() -> Environment:
+def _template_environment() -> Environment:
     loader = PackageLoader("icrl4aht_baselines.report")
     blocks: Any = {"trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, **blocks)
@@ -335,7 +336,7 @@ def _page_values(
 ) -> dict[str, Any]:
     """Return the variables of the template page.html."""
     protocols = list(dict.fromkeys(run.protocol for run in runs))
-    labels = list(dict.fromkeys(run.label for run in runs))  # so that a run has the same colour under all protocols
+    labels = list(dict.fromkeys(run.label for run in runs))  # the index of a label gives its colour
     agents = list(dict.fromkeys(run.agent for run in runs))
     names = ", ".join(agents) if len(agents) <= 4 else f"{', '.join(agents[:3])} and {len(agents) - 3} more"
     found: dict[str, list[Any]] = {"bars": [], "curves": [], "tables": []}

@@ -52,7 +52,7 @@ PUBLISHED_PROTOCOL = "published"
 """Name of the protocol that the paper's numbers belong to."""
 
 BLOCKS = {"all": (0, None), "1": (0, 1), "2-5": (1, 5), "6-20": (5, 20), "21-100": (20, 100), "last 20": (-20, None)}
-"""Name of a block -> its slice of a task's episodes. Results have only the blocks of which an episode was played."""
+"""Name of a block -> its slice of a task's episodes. Results have only blocks with at least one played episode."""
 
 EPISODE_BLOCKS = ("1", "2-5", "6-20", "21-100")
 """Names of the blocks that tables show in columns."""
@@ -146,10 +146,12 @@ def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
         overlaps = sorted_overlaps(" ".join(rows["overlap"].unique()).split())
         cell = ResultCell._make(map(str, key))
         if np.isnan(values).any():
-            raise OptionError(f"{cell.title}: expected equal tasks, seeds and episodes in all runs, found unequal ones")
+            raise OptionError(
+                f"{cell.title}: training runs differ in tasks, seeds or episodes; evaluate all runs alike"
+            )
         trainings, seeds = (tuple(map(int, axes[number])) for number in (0, 2))
         found[cell] = CellReturns(tuple(axes[1]), seeds, blocks, overlaps, trainings)
-    return {cell: found[cell] for cell in in_order(found)}
+    return {cell: found[cell] for cell in sorted_cells(found)}
 
 
 def task_label(task_id: str) -> str:
@@ -360,10 +362,10 @@ def as_run(
             f"the results' {OWN_TASKS}; evaluate again, or copy the manifest of the tasks to {OWN_TASKS}"
         )
     played = grouped(results, lambda result: cell_of(known[result.task_id]))
-    seen = find_seen(settings, where)
+    seen = find_training_record(settings, where)
     agent, seeds = (settings["agent"], settings["protocol"]["name"]), settings["seeds"]
     rows, cells, tracks = [], {}, defaultdict(dict)
-    for cell in in_order(played):
+    for cell in sorted_cells(played):
         of_cell = tuple(known[result.task_id] for result in played[cell])
         track = "" if "" in seen else track_of(cell.layout)
         returns = np.array([result.returns for result in played[cell]], np.float64)  # (tasks, seeds, episodes)
@@ -379,10 +381,10 @@ def as_run(
     return EvaluationRun(*agent, pd.DataFrame(rows, columns=TABLE_COLUMNS), cells, sources=sources)
 
 
-def find_seen(settings: dict[str, Any], where: str) -> dict[str, SeenInTraining | None]:
+def find_training_record(settings: dict[str, Any], where: str) -> dict[str, SeenInTraining | None]:
     """Return track -> layouts and teammates in an agent's training; None if the results do not state them.
 
-    The only key is empty, unless the agent has a separate model for each track. Reference egos have an empty record.
+    The only key is "", unless the agent has a separate model for each track. Reference egos have an empty record.
     """
     details = settings.get("details", {})
     if TRAINED_ON not in details:
@@ -394,10 +396,10 @@ def find_seen(settings: dict[str, Any], where: str) -> dict[str, SeenInTraining 
 
 
 def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
-    """Merge runs of one agent under one protocol that cover disjoint result cells, such as those of a model per layout.
+    """Merge runs of one agent under one protocol that cover disjoint result cells, such as runs on single layouts.
 
-    Runs that overlap, or differ in rules, seeds, play mode or encoder, stay separate; later ones get their folder as
-    `note`.
+    Runs that overlap, or differ in rules, seeds, play mode or encoder, stay separate; later runs get their
+    folder as `note`.
     """
     merged: list[EvaluationRun] = []
     for run in runs:
@@ -408,7 +410,7 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
             merged.append(replace(run, note=run.sources[0].folder) if same else run)
             continue
         both = other.cells | run.cells
-        cells = {cell: both[cell] for cell in in_order(both)}
+        cells = {cell: both[cell] for cell in sorted_cells(both)}
         table, sources = pd.concat([other.table, run.table], ignore_index=True), other.sources + run.sources
         merged[merged.index(other)] = replace(other, table=table, cells=cells, sources=sources)
     return merged
@@ -439,7 +441,7 @@ def cell_of(task: Task) -> ResultCell:
     return ResultCell(task.layout.name, task.teammate_family, kind)
 
 
-def in_order(cells: Iterable[ResultCell]) -> list[ResultCell]:
+def sorted_cells(cells: Iterable[ResultCell]) -> list[ResultCell]:
     """Return result cells in the paper's order, without repetitions."""
     return sorted(set(cells), key=lambda cell: cell.order)
 

@@ -29,8 +29,8 @@ from icrl4aht_baselines.report.results import (
     ResultCell,
     bundled_by_id,
     cell_of,
-    in_order,
     mean_of,
+    sorted_cells,
     task_label,
 )
 from icrl4aht_baselines.report.statistics import (
@@ -50,7 +50,7 @@ from icrl4aht_data.utils.text import counted_noun
 
 
 class TaskScale(NamedTuple):
-    """Reference returns S and B of a task, which its score is relative to.
+    """Reference returns S and B of a task: a return of S is a score of 0, a return of B is a score of 1.
 
     Attributes:
         stay: S, mean return of the ego `stay`.
@@ -96,11 +96,11 @@ CellScales = Mapping[ResultCell, CellScale]
 def bundled_cells() -> dict[ResultCell, list[str]]:
     """Return result cell -> task ids, for all tasks in the package."""
     found = grouped([task for split in EVALUATION_SPLITS for task in bundled_by_id(split).values()], cell_of)
-    return {cell: [task.task_id for task in found[cell]] for cell in in_order(found)}
+    return {cell: [task.task_id for task in found[cell]] for cell in sorted_cells(found)}
 
 
 def behaviour_names() -> dict[str, str]:
-    """Return label of a task -> name of its teammate's behaviour, which is the id of the first such task.
+    """Return label of a task -> name of its teammate's behaviour, which is the id of the first task that has it.
 
     The result covers the package's test tasks and all tasks with best responses.
     """
@@ -111,7 +111,8 @@ def behaviour_names() -> dict[str, str]:
 def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
     """Return result cell -> reference returns under a protocol, for cells whose tasks all have best responses.
 
-    A layout's test cells are included only if those in which the oracle earns more than `stay` all have best responses.
+    The test cells of a layout are left out if the layout has a test cell without best responses in which the oracle
+    earns more than `stay`.
     """
     measured, stays, names = best_responses(protocol), stay_returns(protocol), behaviour_names()
     found: dict[ResultCell, CellScale] = {}
@@ -129,8 +130,8 @@ def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
 def add_scales(table: pd.DataFrame) -> pd.DataFrame:
     """Return a table of results with additional columns `stay` and `best`, the reference returns S and B of each task.
 
-    Unknown values are empty. Under the control `swapped`, only the block of the last episodes has values, because other
-    teammates play before; under a protocol that swaps teammates there are no values.
+    Unknown values are empty. Under the control `swapped`, only the block of the last episodes has values, because
+    another teammate plays before. Under a protocol that swaps teammates, all values are empty.
     """
     scaled = table.assign(stay=np.nan, best=np.nan)
     has_scale = (table["control"] != "swapped") | (table["block"] == "last 20")
@@ -143,9 +144,9 @@ def add_scales(table: pd.DataFrame) -> pd.DataFrame:
     return scaled
 
 
-def open_cells(scales: CellScales, track: str | None = None) -> list[ResultCell]:
+def cells_with_headroom(scales: CellScales, track: str | None = None) -> list[ResultCell]:
     """Return the test cells with headroom, optionally only those of a track, in the paper's order."""
-    cells = in_order(cell for cell, scale in scales.items() if scale.has_headroom and cell.kind == "test")
+    cells = sorted_cells(cell for cell, scale in scales.items() if scale.has_headroom and cell.kind == "test")
     return [cell for cell in cells if track is None or cell.layout in TRACKS[track]["test"]]
 
 
@@ -220,7 +221,7 @@ def _gains_and_scales(returns: CellReturns, scale: CellScale) -> tuple[np.ndarra
 
 
 def behaviour_stratum(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
-    """Return a stratum with behaviours as units, or with seeds as units if there is a single behaviour.
+    """Return a stratum of the bootstrap, whose units are behaviours, or seeds if there is a single behaviour.
 
     Args:
         values: numerators of the tasks, (T, U, S).
@@ -237,10 +238,10 @@ def behaviour_stratum(values: np.ndarray, scales: np.ndarray, behaviours: Sequen
 def score_difference(
     one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], scales: CellScales
 ) -> MeanInterval:
-    """Return the score of one agent minus that of another, paired by task, seed and number of the training."""
+    """Return the score of one agent minus that of another, paired by task, seed and training run."""
     groups: dict[str, list[Stratum]] = defaultdict(list)
     for cell in cells:
-        first, second = (_gains_and_scales(of, scales[cell]) for of in paired(one[cell], other[cell]))
+        first, second = (_gains_and_scales(of, scales[cell]) for of in common_results(one[cell], other[cell]))
         groups[cell.layout].append(behaviour_stratum(first[0] - second[0], *first[1:]))
     return ratio_interval([*groups.values()])
 
@@ -248,7 +249,7 @@ def score_difference(
 def block_difference(
     one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], block: str
 ) -> MeanInterval | None:
-    """Return the mean over result cells of one agent's return minus another's, paired by task, seed and training.
+    """Return the mean of one agent's return minus another's over result cells, paired by task, seed and training run.
 
     Args:
         one: results of the first agent.
@@ -261,7 +262,7 @@ def block_difference(
     """
     groups, alike = [], behaviour_names()
     for cell in (cell for cell in cells if cell in one and cell in other):
-        first, second = paired(one[cell], other[cell])
+        first, second = common_results(one[cell], other[cell])
         if block not in first.blocks or block not in second.blocks:
             return None
         names = [alike.get(task, task) for task in first.tasks]
@@ -269,8 +270,8 @@ def block_difference(
     return ratio_interval(groups) if groups else None
 
 
-def paired(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:
-    """Return two agents' results in a cell, reduced to common tasks, seeds and training runs in the same order."""
+def common_results(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:
+    """Return two agents' results in a cell, reduced to their common tasks, seeds and training runs."""
     common: dict[str, Any] = {
         axis: tuple(key for key in getattr(one, axis) if key in getattr(other, axis))
         for axis in ("trainings", "tasks", "seeds")
@@ -289,10 +290,10 @@ def scored_cells(run: EvaluationRun, cells: Iterable[ResultCell], scales: CellSc
 
 
 def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str]:
-    """Return two lines of text for each track: M and P, as means over layouts and families with 95 % intervals.
+    """Return two lines of text for each track: the benefits M of memory and P of the right context.
 
-    For the intervals, the teammates' behaviours are resampled within each layout and family, or the seeds if there is
-    only one behaviour.
+    M and P are means over layouts and families with 95 % intervals. For the intervals, the teammates' behaviours are
+    resampled within each layout and family, or the seeds if there is only one behaviour.
 
     Args:
         results: results of an ego and its controls.

@@ -49,7 +49,7 @@ class MeanInterval(NamedTuple):
 
 
 class Stratum(NamedTuple):
-    """Units of one group, within which units are resampled.
+    """Group of units, within which the bootstrap resamples.
 
     Attributes:
         gains: numerators of the units in each training run, (T, U).
@@ -111,7 +111,7 @@ def _resample(stratum: Stratum, resamples: int, rng: np.random.Generator) -> Str
 
 
 def _estimate(groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R T"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ratio of gains to scales, mean over groups, of each resample, and its variance, both (R,).
+    """Return the mean over groups of the ratio of gains to scales in each resample, and its variance, both (R,).
 
     Args:
         groups: strata with gains (R, T, U) and scales (R, U).

@@ -1,7 +1,7 @@
-"""Result files (submissions) for the page of results: made from folders of `evaluate`, checked, and read.
+"""Submissions: files of results for the page of results. Functions make, check, write and read them.
 
-A file has the return of every episode, so all numbers of the page can be computed from it. `Submission` defines the
-content; `icrl4aht-data submit --schema` prints the JSON schema.
+A submission has the return of every episode, so all numbers of the page can be computed from it. `Submission` defines
+the content; `icrl4aht-data submit --schema` prints the JSON schema.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import AGENTS, OTHER_WAYS
 from icrl4aht_baselines.evaluate.protocols import CONTROLS, bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.results import RESULTS
-from icrl4aht_baselines.report.results import find_seen, read_results
+from icrl4aht_baselines.report.results import find_training_record, read_results
 from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -129,7 +129,7 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
             results = read_results(source)
             settings = results[0].settings
             if any(result.settings != settings for result in results):
-                raise OptionError(f"{source}: results of different settings in one folder; evaluate again")
+                raise OptionError(f"{source}: the results have different settings; evaluate all tasks again")
             if not control:  # the controls in a folder are of the same training run
                 way = next((one for one in OTHER_WAYS if settings["agent"].endswith(f" ({one})")), "")
                 training = max(counts[way, result.task_id] for result in results)
@@ -160,8 +160,8 @@ def check_submission(found: Submission, where: str) -> None:
     known = read_best_responses().version
     if found.best_responses != known:
         raise OptionError(
-            f"{where}: best responses of version {found.best_responses!r}, expected {known!r}, that of this package: "
-            f"run `icrl4aht-data submit` of this version again"
+            f"{where}: made with best responses {found.best_responses!r}, but this package has {known!r}; make the "
+            f"file again with `icrl4aht-data submit`"
         )
     played: dict[tuple[str, int], list[str]] = defaultdict(list)
     for one in found.evaluations:
@@ -194,7 +194,7 @@ def _check_name(found: Submission, where: str) -> None:
     if not re.fullmatch(_NAME, found.agent) or found.agent.endswith(tuple(f" ({way})" for way in OTHER_WAYS)):
         raise OptionError(
             f"{where}: agent {found.agent!r}: expected a name on one line without |, ` and outer spaces, and without a "
-            f"play mode at its end, which the settings state already; give another --name"
+            f"play mode at the end, which the settings state already; give another --name"
         )
 
 
@@ -203,7 +203,7 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
     try:
         protocol, seeds, code = (one.settings[name] for name in ("protocol", "seeds", "code_version"))
     except (KeyError, TypeError) as error:
-        raise OptionError(f"{where}: the settings have no {error}, expected those of `evaluate`") from error
+        raise OptionError(f"{where}: the settings have no {error}; expected results of `evaluate`") from error
     if code != version("icrl4aht-data"):
         raise OptionError(
             f"{where}: made with icrl4aht-data {code}, but {version('icrl4aht-data')} is installed; evaluate again, or "
@@ -230,7 +230,7 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
             f"{where}: results of {' and '.join(sorted(marks)) or 'no control'}, expected "
             f"{''.join(expected) or 'no control'}; give the folder that `evaluate --controls` wrote"
         )
-    if None in find_seen(one.settings, where).values():
+    if None in find_training_record(one.settings, where).values():
         raise OptionError(
             f"{where}: no declaration of the training data; give `evaluate` details={{'{TRAINED_ON}': [...]}}, an "
             f"empty list for an agent that was not trained"
@@ -244,7 +244,7 @@ def write_submission(path: Path, found: Submission) -> None:
 
 
 def read_submission(path: Path) -> Submission:
-    """Return the submission in a file, after a check of its content.
+    """Read a submission from a file and check its content.
 
     Raises:
         OptionError: if the file is not a submission, or for the reasons of `check_submission`.

@@ -78,13 +78,13 @@ def test_model_bundled_as_sampled_samples_its_actions_by_default(trained_run, tm
 
 def test_bundling_rejects_invalid_names_unfinished_runs_and_large_models(trained_run, tmp_path, monkeypatch):
     for name in ("../ad", "oracle", "AD-x", ""):
-        with pytest.raises(OptionError, match="expected words of small letters and digits with hyphens: ad-reference"):
+        with pytest.raises(OptionError, match="expected lowercase words joined by hyphens, such as ad-reference"):
             bundle_run(trained_run, name, "teammate", tmp_path)
     config = json.loads((trained_run / "config.json").read_text())
     half = tmp_path / "half"
     shutil.copytree(trained_run, half)
     (half / "config.json").write_text(json.dumps(config | {"train": config["train"] | {"steps": 9}}))
-    with pytest.raises(OptionError, match="half: stopped at step 1 of 9; resume training with the same command"):
+    with pytest.raises(OptionError, match="half: training stopped at step 1 of 9; resume it with the same command"):
         bundle_run(half, "ad-tiny", "teammate", tmp_path / "models")
     monkeypatch.setattr(bundled, "_LARGEST", 1000)
     with pytest.raises(OptionError, match=r"parameters of [\d,]+ bytes, expected at most 1,000: bundle a smaller"):

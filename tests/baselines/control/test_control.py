@@ -41,7 +41,7 @@ def test_source_algorithms_improve_within_a_history():
         regret = (means.max(axis=1, keepdims=True) - np.take_along_axis(means, actions, axis=1)).sum(axis=1).mean()
         assert regret < uniform / 2
     goals = np.delete(np.arange(worlds.CELLS), worlds.MIDDLE)
-    cells, actions, rewards = worlds.search(np.tile(goals, 10), 20, rng)
+    cells, actions, rewards = worlds.search_histories(np.tile(goals, 10), 20, rng)
     np.testing.assert_array_equal(cells.reshape(-1, worlds.ROOM_STEPS)[:, 0], worlds.MIDDLE)
     shares = rewards.reshape(len(cells), 20, -1).sum(axis=-1) / worlds.best_return(np.tile(goals, 10))[:, None]
     assert shares[:, 0].mean() < 0.3

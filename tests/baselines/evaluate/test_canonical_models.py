@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from icrl4aht_baselines.agents.egos import find_agent, with_view
+from icrl4aht_baselines.agents.egos import find_agent, with_channels
 from icrl4aht_baselines.agents.host import EgoInput, from_host
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
@@ -86,7 +86,7 @@ def test_jax_egos_receive_canonical_channels_on_every_layout(layout):
     before = EgoInput(zero, zero + 1, jnp.array([2.0]), zero + 3, zero > 0)
     state = RolloutState(EnvState(key, zero, zero, jnp.asarray(record[None])), (), before)
     for channels in ("own", "canonical"):
-        rollout = EvaluationRollout(layout, with_view(shown, channels), [], PROTOCOLS["seeded"])
+        rollout = EvaluationRollout(layout, with_channels(shown, channels), [], PROTOCOLS["seeded"])
         seen: Any = jax.jit(rollout.ego_actions)((), state, key)[0]
         np.testing.assert_array_equal(seen.obs[0], observe(layout, record, 0, canonical=channels == "canonical"))
         assert seen._replace(obs=0) == before._replace(obs=0)

@@ -15,7 +15,7 @@ from icrl4aht_baselines.evaluate import ControlledResults, evaluate_controls
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol, plan_tasks, segment_lengths
 from icrl4aht_baselines.evaluate.results import Result
-from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, Programs, task_key
+from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, ProgramCache, task_key
 from icrl4aht_baselines.report.results import read_run
 from icrl4aht_baselines.report.scores import control_lines
 from icrl4aht_generation.policy import Policy
@@ -63,7 +63,7 @@ def ego(mode):
 @pytest.fixture(scope="module")
 def compiled_programs():
     """Return a cache of compiled programs that all tests of this module share."""
-    return Programs()
+    return ProgramCache()
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +252,7 @@ def test_next_segment_starts_with_its_own_recipes():
 
 def test_evaluate_command_with_controls_writes_all_results(compiled_programs, tmp_path, monkeypatch):
     monkeypatch.setattr("icrl4aht_baselines.agents.egos.find_agent", lambda name, **mode: NamedEgo(name, ego(PAID)))
-    monkeypatch.setattr("icrl4aht_baselines.evaluate.evaluator.Programs", lambda: compiled_programs)
+    monkeypatch.setattr("icrl4aht_baselines.evaluate.evaluator.ProgramCache", lambda: compiled_programs)
     write_tasks(tmp_path / "two.jsonl", TASKS)
 
     def run_evaluate(folder, *options, code=0):

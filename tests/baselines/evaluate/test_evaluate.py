@@ -151,8 +151,8 @@ def test_out_of_range_action_of_host_agent_raises_error():
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        (np.zeros((1, 1), int), r"returned int64 of shape \(1, 1\), expected integers \(1,\)"),
-        (np.zeros(1), r"returned float64 of shape \(1,\), expected integers \(1,\)"),
+        (np.zeros((1, 1), int), r"returned int64 of shape \(1, 1\), expected integers of shape \(1,\)"),
+        (np.zeros(1), r"returned float64 of shape \(1,\), expected integers of shape \(1,\)"),
     ],
 )
 def test_host_agent_actions_of_wrong_shape_or_type_raise_errors(actions, message):

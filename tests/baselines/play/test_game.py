@@ -59,5 +59,5 @@ def test_find_partner_accepts_known_names_only(tmp_path):
     assert find_partner("human", LAYOUT, 1).player is None
     with pytest.raises(UnknownNameError, match=r"valid: human, stay.*H1/t0.*Did you mean 'oracle'"):
         find_partner("orakel", LAYOUT, 1)
-    with pytest.raises(UnknownNameError, match="not a run"):
+    with pytest.raises(UnknownNameError, match="expected a run folder"):
         find_partner(str(tmp_path), LAYOUT, 1)

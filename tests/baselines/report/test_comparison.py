@@ -101,8 +101,10 @@ def test_mean_best_return_uses_stay_for_families_without_best_response(invented_
     ring = [cell for cell in scales if cell.layout == "coord_ring"]
     h2 = next(cell for cell in ring if cell.family == "H2")
     others = sum(stay[cell[:2]]["stay"] for cell in ring if cell != h2)
-    assert comparison.mean_best("coord_ring", {h2: scales[h2]}) == pytest.approx((scales[h2].best + others) / 4)
-    assert comparison.mean_best("coord_ring", {cell: scales[cell] for cell in scales if cell not in ring}) is None
+    assert comparison.mean_best_return("coord_ring", {h2: scales[h2]}) == pytest.approx((scales[h2].best + others) / 4)
+    assert (
+        comparison.mean_best_return("coord_ring", {cell: scales[cell] for cell in scales if cell not in ring}) is None
+    )
 
 
 def test_results_page_is_written_with_and_without_best_responses(stored, tmp_path, response_files, monkeypatch):
@@ -126,11 +128,11 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
 
 @pytest.mark.parametrize("texts", ["{", "[]", '{"a": {}}', "{}"])
 def test_damaged_stored_results_raise_error(texts, tmp_path):
-    with pytest.raises(OptionError, match=r"none\.json: not stored results: FileNotFoundError.*restore it"):
+    with pytest.raises(OptionError, match=r"none\.json: not stored results: FileNotFoundError.*restore this file"):
         comparison.read_stored(tmp_path / "none.json")
     (tmp_path / "bad.json").write_text(texts)
     (tmp_path / "bad.csv").write_text("agent,protocol\n")
-    with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*restore it, bad\.csv\.gz and bad_curves"):
+    with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*this file, bad\.csv\.gz and bad_curves"):
         comparison.read_stored(tmp_path / "bad.json")
 
 

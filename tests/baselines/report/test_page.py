@@ -200,7 +200,7 @@ def test_restoring_an_unknown_or_missing_ego_raises_error(tmp_path):
         OptionError, match="AD is neither a reference ego, nor a bundled model, nor a model with a run folder"
     ):
         restore_ego(source)
-    with pytest.raises(OptionError, match=r"its run folder .*/gone is missing"):
+    with pytest.raises(OptionError, match=r"the run folder .*/gone of .* is missing"):
         restore_ego(source._replace(trained={"run": str(tmp_path / "gone")}))
 
 

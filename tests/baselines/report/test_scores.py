@@ -43,7 +43,7 @@ SCALES = {
 
 def test_score_is_a_ratio_of_sums_on_each_layout():
     cells = {WIDE: cell_returns(5.0, 15.0, 0.0, 10.0), RING: cell_returns(10.0, 10.0, 7.0), FLAT: cell_returns(99.0)}
-    assert scores.open_cells(SCALES) == [RING, WIDE], "FLAT has headroom of less than 5"
+    assert scores.cells_with_headroom(SCALES) == [RING, WIDE], "FLAT has headroom of less than 5"
     score = scores.find_score(cells, [RING, WIDE], SCALES)
     assert score is not None
     wide, ring = (5 + 10 + 0 + 10) / (10 + 20 + 10 + 10), 27 / 81
@@ -85,15 +85,15 @@ def test_layout_with_a_missing_best_response_has_no_score(invented_responses, mo
     kept = tuple(one for one in card.behaviours if one != lacks)
     best_responses.write_best_responses(tmp_path / "less.json", structs.replace(card, behaviours=kept))
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: tmp_path / "less.json")
-    found = scores.open_cells(scores.cell_scales("seeded"))
+    found = scores.cells_with_headroom(scores.cell_scales("seeded"))
     assert len(found) == 16 and "demo_wide" not in {cell.layout for cell in found}
 
 
 def test_score_scales_cover_all_tasks_with_a_best_response(invented_responses):
     scales = scores.cell_scales("seeded")
     assert (
-        len(scores.open_cells(scales)) == 20
-        and RING in scores.open_cells(scales)
+        len(scores.cells_with_headroom(scales)) == 20
+        and RING in scores.cells_with_headroom(scales)
         and scores.cell_scales("published") == {}
     )
     assert all(len(scale.tasks) == 5 for scale in scales.values())

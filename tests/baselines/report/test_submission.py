@@ -58,9 +58,9 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
     [
         (lambda c, one, task: c.update(agent="search"), "search names a reference ego or a bundled model; give"),
         (lambda c, one, task: c.update(agent="ad-rising"), "ad-rising names a reference ego or a bundled"),
-        (lambda c, one, task: c.update(agent="rule (greedy)"), "without a play mode at its end"),
+        (lambda c, one, task: c.update(agent="rule (greedy)"), "without a play mode at the end"),
         (lambda c, one, task: c.update(agent="a | b"), "not a file of results: .*matching regex"),
-        (lambda c, one, task: c.update(best_responses="99"), r"best responses of version '99', expected '0'"),
+        (lambda c, one, task: c.update(best_responses="99"), r"best responses '99', but this package has '0'"),
         (lambda c, one, task: one["settings"]["details"].clear(), "no declaration of the training data"),
         (lambda c, one, task: one["settings"]["protocol"].update(four_recipes=True), "'four_recipes': True"),
         (lambda c, one, task: one.update(control="swap"), "control 'swap', expected cleared or swapped"),
@@ -90,7 +90,7 @@ def test_results_that_cannot_be_submitted_raise_errors(tmp_path):
     with pytest.raises(OptionError, match="undeclared: rule, training 0: no declaration of the training data"):
         make_submission([folder], FACTS)
     paths = sorted((folder / "tasks").iterdir())
-    messages = "results of different settings in one folder", r"made with icrl4aht-data 0\.0\.1, but"
+    messages = "the results have different settings", r"made with icrl4aht-data 0\.0\.1, but"
     for changed, message in zip((paths[:1], paths), messages, strict=True):
         for path in changed:
             result = read_result(path)
