@@ -36,12 +36,6 @@ _KNOWN = re.compile(
 content of a downloaded file such as .git/config, sitecustomize.py or x.pth."""
 
 
-META_FILE = re.compile(r"meta/[^/]+")
-"""Pattern of the files in meta/, except chunk tables. Opening a release checks their hashes."""
-
-_SOURCE_CARD = "meta/source_card.md"  # written only by earlier versions of this package
-
-
 @lru_cache(maxsize=16)
 def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
     """Parse a manifest, and return the SHA-256 of each file by path in the release; results are cached.
@@ -118,15 +112,9 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
 
 
 def check_meta(root: Path) -> None:
-    """Check the files in meta/, except chunk tables, with `check_against_manifest`.
-
-    meta/source_card.md, which earlier versions of this package wrote, may be missing, since no code reads this file.
-    """
-    names = {name for name in read_manifest(root) if META_FILE.fullmatch(name)}
-    if not (root / _SOURCE_CARD).exists():
-        names.discard(_SOURCE_CARD)
-    names |= {name for name in INDEX_FILES if (root / name).exists()}
-    check_against_manifest(root, sorted(names))
+    """Check those of `INDEX_FILES` that are listed or present with `check_against_manifest`."""
+    listed = read_manifest(root)
+    check_against_manifest(root, sorted(name for name in INDEX_FILES if name in listed or (root / name).exists()))
 
 
 def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
