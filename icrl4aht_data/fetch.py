@@ -325,8 +325,8 @@ def _open_address(address: str, to: Path | None) -> Remote:
             _, text = _fetch_manifest(client, url, Path(scratch))
         if to is None:
             (base / disk.short_hash(text)).mkdir(parents=True, exist_ok=True)
-            with disk.process_lock(disk.lock_path(latest)), disk.atomic_write(latest) as partial:
-                partial.write_text(disk.short_hash(text))
+            with disk.process_lock(disk.lock_path(latest)):
+                disk.write_atomically(latest, disk.short_hash(text))
     folder = to or base / disk.short_hash(text)
     _prepare_folder(folder, text, url, is_ours=to is None)
     return Remote(folder, url, disk.short_hash(text), client)
@@ -367,8 +367,7 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
         if folder.exists() and any(folder.iterdir()) and not is_ours:
             raise OptionError(f"{folder}: not empty, and not a download of {url}; give a new or an empty folder")
         folder.mkdir(parents=True, exist_ok=True)
-        with disk.atomic_write(path) as partial:
-            partial.write_bytes(text)
+        disk.write_atomically(path, text)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from icrl4aht_data.overcooked.drawing import AGENT_COLOURS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import faults
 from icrl4aht_data.reading.history import History
-from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.files import write_atomically
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_histories
 
@@ -206,8 +206,7 @@ def make_browser_page(
 
 def save_browser_page(page: BrowserPage, path: Path) -> None:
     """Write an HTML page to a file atomically."""
-    with atomic_write(path) as partial:
-        partial.write_bytes(page.html)
+    write_atomically(path, page.html)
 
 
 def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:

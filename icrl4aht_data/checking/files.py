@@ -48,11 +48,9 @@ def check_files(
         try:
             path = resolve_inside(root, name)
             size, right = path.stat().st_size, sizes.get(name)
-            if right is None and size > LARGEST:
-                report.add(name, f"expected at most {LARGEST:,} bytes, found {size:,}")
-                continue
-            if right is not None and size != right:
-                report.add(name, f"expected {right:,} bytes, found {size:,}")
+            if size > LARGEST if right is None else size != right:
+                expected_size = f"at most {LARGEST:,}" if right is None else f"{right:,}"
+                report.add(name, f"expected {expected_size} bytes, found {size:,}")
                 continue
             found = listed[name] if quick and name not in INDEX_FILES else file_hash(path)
         except (Icrl4ahtError, OSError) as error:

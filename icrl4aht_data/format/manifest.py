@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 from icrl4aht_data.errors import ChunkTableError, IndexFormatError, UnsafePathError
 from icrl4aht_data.format.schema import EXPERTS, INDEX_FILES, MANIFEST, PARQUET_EPISODES, PARQUET_INDEX, TEAMMATES
-from icrl4aht_data.utils.files import atomic_write, checked_hash, file_hash, is_safe_path, read_text, resolve_inside
+from icrl4aht_data.utils.files import checked_hash, file_hash, is_safe_path, read_text, resolve_inside, write_atomically
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
@@ -133,5 +133,4 @@ def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
     if foreign:
         raise UnsafePathError(f"{root}: {foreign[0]!r} is not a file that a release may contain; remove it")
     lines = [f"{known.get(name) or file_hash(root / name)}  {name}\n" for name in names if name != MANIFEST]
-    with atomic_write(root / MANIFEST) as partial:
-        partial.write_text("".join(lines), encoding="utf-8")
+    write_atomically(root / MANIFEST, "".join(lines))
