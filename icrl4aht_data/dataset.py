@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, Unpack
@@ -25,7 +25,7 @@ from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.plotting import Picture, plot_learning_curves
 from icrl4aht_data.reading.episodes import Episode
 from icrl4aht_data.reading.history import Obs
-from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
+from icrl4aht_data.reading.selection import Filters, ReadOptions, Selection
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.reading.splitting import SPLIT_BY, SplitBy, choose_histories, choose_teammates
@@ -47,22 +47,11 @@ MINI = Path(__file__).parent / "mini"
 def load_icrl4aht(
     root: str | Path | None = None,
     *,
-    split: FilterValues = None,
-    layout: FilterValues = None,
-    layout_family: FilterValues = None,
-    track: FilterValues = None,
-    teammate_family: FilterValues = None,
-    teammate_kind: FilterValues = None,
-    algorithm: FilterValues = None,
-    source: FilterValues = None,
-    label_view: FilterValues = None,
-    task_id: FilterValues = None,
-    learner: int | Sequence[int] | None = None,
-    min_expert_return: float | None = None,
     obs: Obs = "float32",
     cache: CacheMode = "auto",
     threads: int | None = None,
     channels: Channels = "own",
+    **filters: Unpack[Filters],
 ) -> Dataset:
     """Open a release and return a selection of its histories.
 
@@ -105,21 +94,7 @@ def load_icrl4aht(
         ReleaseError: if the release cannot be read.
     """
     options = ReadOptions(obs, cache, usable_cores() if threads is None else threads, channels)
-    dataset = open_dataset(open_root(MINI if root is None else root), options)
-    return dataset.filter(
-        split=split,
-        layout=layout,
-        layout_family=layout_family,
-        track=track,
-        teammate_family=teammate_family,
-        teammate_kind=teammate_kind,
-        algorithm=algorithm,
-        source=source,
-        label_view=label_view,
-        task_id=task_id,
-        learner=learner,
-        min_expert_return=min_expert_return,
-    )
+    return open_dataset(open_root(MINI if root is None else root), options).filter(**filters)  # type: ignore[arg-type]
 
 
 def open_dataset(location: ReleaseLocation, options: ReadOptions) -> Dataset:

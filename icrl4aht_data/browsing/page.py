@@ -210,7 +210,8 @@ def save_browser_page(page: BrowserPage, path: Path) -> None:
 
 
 def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
-    name, info = _release_name(dataset), dataset.info
+    info, origin = dataset.info, dataset.origin
+    name = str(origin) if isinstance(origin, Remote) else dataset.root.resolve().name  # a name without local folders
     by_layout = grouped(embedded, lambda one: one.facts["layout"])
     index = {
         "release": {"name": name, "kind": info.kind, "version": info.data_version, "histories": info.histories},
@@ -239,11 +240,6 @@ def _teammate_label(dataset: Dataset, history_id: int) -> str:
     entry = dataset.index.entry(history_id)
     name = f"{entry.teammate_family}/{entry.teammate_kind}"
     return f"{name} t{dataset.recover_teammate(history_id)['theta_id']}" if dataset.has_tasks else name
-
-
-def _release_name(dataset: Dataset) -> str:
-    """Return the address of a remote release, or the name of a local folder without its path."""
-    return str(dataset.origin) if isinstance(dataset.origin, Remote) else dataset.root.resolve().name
 
 
 def page_style() -> str:

@@ -260,13 +260,11 @@ class Index:
         """
         if name == "layout":
             return get_layout(str(value)).name
-        if value in (own := [one for one in self.values(name) if one]):
-            return value  # saves time, since `check_family` searches the installed packages
         if name == "teammate_family":
             check_family(value)
         else:
             known = {"split": SPLITS, "track": ALL_TRACKS, "source": SOURCES, "label_view": LABEL_VIEWS}.get(name, ())
-            check_choice(given, value, (*known, *own))
+            check_choice(given, value, (*known, *filter(None, self.values(name))))
         return value
 
 
