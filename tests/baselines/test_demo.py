@@ -39,7 +39,7 @@ EARNED = {"stay": (0.0, 0.0), "search": (-20.0, 40.0), "oracle": (40.0, 40.0)}
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
-    """Return a release of random play with histories of the sources search and ppo."""
+    """Return a release of random play with histories of the sources `search` and `ppo`."""
     root = tmp_path_factory.mktemp("demo") / "release"
     random_release(root, layouts=("demo_wide",), streams=2, length=100, sources=("search", "ppo"))
     return root

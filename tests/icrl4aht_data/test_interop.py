@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.interop import IGNORED, hf_episodes, hf_index, hf_windows, torch_loader
-from tests.helpers.batches import assert_equal
+from tests.helpers.batches import assert_equal_batches
 from tests.helpers.commands import run_python
 
 
@@ -60,7 +60,7 @@ class TestGrain:
             found = list(source.to_iter_dataset(options))
             assert len(found) == len(sampler)
             for i, batch in enumerate(found):
-                assert_equal(batch, sampler[i])
+                assert_equal_batches(batch, sampler[i])
 
 
 ONE_CORE = "ignore:This DataLoader will create:UserWarning"

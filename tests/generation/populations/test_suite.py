@@ -42,7 +42,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import file_hash
 from tests.helpers.damages import flip_bit
-from tests.helpers.tiny import start
+from tests.helpers.tiny import start_python
 from tests.helpers.xla_flags import add_xla_flag
 
 LAYOUT = get_layout("cramped_up")
@@ -233,7 +233,7 @@ def test_population_on_two_devices_learns_the_same_policies(tmp_path):
     (stage,) = run_of("fcp").stages
     state, _ = jax.jit(stage.update)(jax.jit(stage.init)(jax.random.fold_in(jax.random.key(0), 0)))
     flags = add_xla_flag("--xla_force_host_platform_device_count=2")
-    process = start("-c", TWO_DEVICES, str(tmp_path / "weights.npz"), XLA_FLAGS=flags)
+    process = start_python("-c", TWO_DEVICES, str(tmp_path / "weights.npz"), XLA_FLAGS=flags)
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
     found = np.load(tmp_path / "weights.npz")

@@ -13,7 +13,7 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.commands import run_cli
 from tests.helpers.published_files import KEPT
 from tests.helpers.random_releases import make_tasks
-from tests.helpers.spoiled import problems, spoiled
+from tests.helpers.spoiled import problems, spoiled_copy
 
 
 class TestVerifyObservations:
@@ -45,11 +45,13 @@ class TestVerifyObservations:
     def test_verify_finds_wrong_scores_and_episode_counts_in_the_index(
         self, converted_release, tmp_path, change, message
     ):
-        found = problems(spoiled(converted_release, tmp_path / "r", HISTORIES, lambda lines: lines[1].update(change)))
+        found = problems(
+            spoiled_copy(converted_release, tmp_path / "r", HISTORIES, lambda lines: lines[1].update(change))
+        )
         assert any(message in line for line in found), found
 
 
-def test_convert_accepts_observations_except_for_forms_that_need_states(published_folder, tmp_path):
+def test_observations_cannot_be_converted_to_forms_that_need_states(published_folder, tmp_path):
     out = tmp_path / "out"
     said = run_cli("convert", published_folder[0], "--out", out, "--kept-steps", KEPT)
     assert said == f"{out}: observations, no state records: nothing can be replayed or drawn\n"
