@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import zlib
+from base64 import b64encode
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -225,7 +225,7 @@ def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
         "histories": [one.facts | {"teammate": _teammate_label(dataset, one.facts["history_id"])} for one in embedded],
     }
     packed = zlib.compress(json.dumps(index, separators=(",", ":")).encode(), 9)
-    data = {"index": _to_base64(packed), "histories": [_to_base64(one.data) for one in embedded]}
+    data = {"index": b64encode(packed).decode(), "histories": [b64encode(one.data).decode() for one in embedded]}
     text = Template(page_source("page.html")).substitute(
         release=escape(name),
         style=page_style(),
@@ -252,7 +252,3 @@ def page_style() -> str:
 def page_source(name: str) -> str:
     """Return the text of one of the files that a page is made of, such as `state.js`."""
     return (_FILES / name).read_text(encoding="utf-8")
-
-
-def _to_base64(content: bytes) -> str:
-    return base64.b64encode(content).decode()
