@@ -100,19 +100,13 @@ COMBINATIONS = [
 ]
 
 
-@pytest.mark.parametrize(
-    "combinations",
-    [
-        pytest.param([("mmap", "ad", 1, "spawn")], id="one"),
-        pytest.param(COMBINATIONS, id="all", marks=pytest.mark.slow),
-    ],
-)
-def test_pytorch_workers_return_the_batches_of_the_sampler(lite, tmp_path, combinations):
+@pytest.mark.slow
+def test_pytorch_workers_return_the_batches_of_the_sampler(lite, tmp_path):
     """Run in a separate process, because a process that has run JAX must not fork."""
     script = tmp_path / "loader.py"
     script.write_text(TORCH)
-    printed = run_python("-W", "error", "-W", ONE_CORE, script, lite[0], json.dumps(combinations))
-    assert len(printed.splitlines()) == len(combinations)
+    printed = run_python("-W", "error", "-W", ONE_CORE, script, lite[0], json.dumps(COMBINATIONS))
+    assert len(printed.splitlines()) == len(COMBINATIONS)
 
 
 class TestHuggingFace:

@@ -59,9 +59,10 @@ RESPONSES_FILE = "best_responses.json"
 """Name of the file of best responses, in a folder of training runs and among the package's cards."""
 
 ABOUT = (
-    "Best responses: recurrent PPO with the benchmark's 5 x 5 view, trained with one teammate alone, memory cleared "
-    "before each episode; the oracle is imitated in the first half. The best training is chosen on episodes of seed "
-    f"{CHOICE_SEEDS[0]}; returns are means over the tasks and the seeds {', '.join(map(str, REPORT_SEEDS))}."
+    "Best responses are recurrent PPO agents with the benchmark's 5 x 5 view. Each is trained with one teammate, with "
+    "memory cleared before each episode, and imitates the oracle in the first half of the training. Episodes of seed "
+    f"{CHOICE_SEEDS[0]} decide which training run is used. Returns are means over the tasks and the seeds "
+    f"{', '.join(map(str, REPORT_SEEDS))}."
 )
 
 

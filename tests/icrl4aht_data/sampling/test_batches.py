@@ -153,7 +153,9 @@ def test_position_saved_before_an_option_existed_can_be_resumed(two_sources):
         assert_equal_batches(next(batches), sampler[7])
 
 
-@pytest.mark.parametrize("cache", CACHES)
+@pytest.mark.parametrize(
+    "cache", [pytest.param(cache, marks=[pytest.mark.slow] * (cache != "stream")) for cache in CACHES]
+)
 def test_memory_use_stays_constant_over_many_batches(lite, cache):
     def resident_bytes() -> int:
         gc.collect()
