@@ -24,6 +24,7 @@ from icrl4aht_data.overcooked.cells import COOKED, GOAL, PLATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import columns, ingredient_count, possible_recipes, unpack
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE, OracleMemory, oracle_params
+from icrl4aht_generation.paths import Scene
 from icrl4aht_generation.policy import Policy, Situation
 
 _FLAGS = np.uint8(PLATE | COOKED)
@@ -116,15 +117,10 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
     had = old.hands[TEAMMATE]
     into_pot = jnp.sum(ingredient_count(new.pot_items)) > jnp.sum(ingredient_count(old.pot_items))
     put = (had >> 2 > 0) & (had & PLATE == 0) & (new.hands[TEAMMATE] == 0) & into_pot
-    seen = memory.seen + jnp.where(put, _pieces(had), 0)
-    fits = (_pieces(dishes) @ seen) / jnp.maximum(seen.sum(), 1)
+    seen = memory.seen + jnp.where(put, Scene.counts(had), 0)
+    fits = (Scene.counts(dishes) @ seen) / jnp.maximum(seen.sum(), 1)
     score = jnp.where(paid, 100.0, fits + 0.1 * memory.order) - 1000.0 * (refused | (dishes == _NO_DISH))
     idle = jnp.all(new.pot_items == 0) & (new.hands[EGO] == 0)
     change = idle | refused[memory.belief] | paid.any()
     belief = jnp.where(change, score.argmax(), memory.belief)
     return memory._replace(paid=paid, refused=refused, seen=seen, belief=belief)
-
-
-def _pieces(items: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
-    """Return the number of pieces of each ingredient in items."""
-    return (items[..., None] >> np.array([2, 4, 6], np.uint8) & 3).astype(jnp.int32)
