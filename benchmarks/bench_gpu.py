@@ -277,7 +277,7 @@ def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
 
 def context_length(sizes: Sizes, size: str) -> int:
     """Return AD's window length, which is L in training and K in acting, for the name of a model size."""
-    return min(sizes.length, SIZES[size].context)
+    return min(sizes.length, SIZES[size].train["context"])
 
 
 CASES: dict[str, Callable[[Sizes], dict[str, Any]]] = {

@@ -183,7 +183,7 @@ def compare_training(
 def untrained_ad(layout: Layout, size: str, acting: Acting) -> Policy:
     """Return an untrained AD model as an ego."""
     method = ad_method(size, [layout])
-    return trained_policy(method, method.init(jax.random.key(0)), SIZES[size].context, PlayMode(acting))
+    return trained_policy(method, method.init(jax.random.key(0)), SIZES[size].train["context"], PlayMode(acting))
 
 
 def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -> Callable[[], None]:
@@ -192,7 +192,7 @@ def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -
     policy = untrained_ad(tasks[0].layout, size, acting)
     episodes = play_episodes(prepare_rollout(lambda layout: policy, tasks, protocol))
     # Windows must be full for cached acting, because exact acting always computes all K positions.
-    for _ in range(-(-SIZES[size].context // steps) if acting == "cached" else 1):
+    for _ in range(-(-SIZES[size].train["context"] // steps) if acting == "cached" else 1):
         next(episodes)
     return lambda: jax.block_until_ready(next(episodes))
 
@@ -200,7 +200,7 @@ def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -
 def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int) -> None:
     """Print steps/s of cached acting on some tasks of a layout, and the ratio to exact acting."""
     tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
-    dropped = dropped_steps(SIZES[size].context)  # number of steps after which the window is computed again
+    dropped = dropped_steps(SIZES[size].train["context"])  # number of steps after which the window is computed again
     lengths: dict[Acting, int] = {"cached": dropped * -(-10 * steps // dropped), "exact": steps}
     ways = {acting: acting_steps(tasks, size, acting, n) for acting, n in lengths.items()}
     rates = rates_in_turn(ways, {acting: n * len(tasks) for acting, n in lengths.items()}, rounds)

@@ -100,8 +100,8 @@ def max_validation_tasks_per_layout() -> int:
 
 
 def tiny_model_size() -> tuple[int, int, int]:
-    assert (TINY_SIZE.encoder, TINY_SIZE.positions) == ("mlp", "rope")
-    return TINY_SIZE.layers, TINY_SIZE.width, TINY_SIZE.context
+    assert (TINY_SIZE.model["encoder"], TINY_SIZE.model["positions"]) == ("mlp", "rope")
+    return TINY_SIZE.model["layers"], TINY_SIZE.model["width"], TINY_SIZE.train["context"]
 
 
 def count_test_behaviours() -> tuple[int, ...]:
@@ -169,7 +169,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/publishing", "of every step ({} to {} bytes)", lambda: range_over_layouts(record_size)),
     ("docs/loading", "Layouts have {} to {} channels", lambda: range_over_layouts(lambda one: one.channels)),
     ("docs/training", "`--size tiny`: {} layers of width {}, one dense layer as the encoder, K = {}", tiny_model_size),
-    ("docs/training", "its {} steps take two cores", lambda: TINY_SIZE.steps),
+    ("docs/training", "its {} steps take two cores", lambda: TINY_SIZE.train["steps"]),
     ("docs/training", "A checkpoint is written every {} minutes", lambda: SAVE_MINUTES),
     ("docs/training", "A {} of the histories are held out", lambda: HistoryOptions(("demo_wide",)).held_out),
     ("docs/format", "{}, the version of this format, or {}", lambda: READABLE_VERSIONS[::-1]),
