@@ -22,27 +22,35 @@ CHANNELS: tuple[Channels, ...] = ("own", "canonical")
 """Sets of observation channels: "own" differs between layouts, "canonical" is the same for all layouts."""
 
 
-def _names(ingredient_types: int, delivery: bool) -> tuple[str, ...]:
-    def item(owner: str) -> list[str]:
+def _list_channels(ingredient_types: int, delivery: bool) -> tuple[str, ...]:
+    def item_names(owner: str) -> list[str]:
         return [f"{owner}_{what}" for what in ("plate", "cooked", *ingredients)]
 
-    def agent(owner: str) -> list[str]:
-        return [f"{owner}_position", *(f"{owner}_facing_{facing}" for facing in FACINGS), *item(owner)]
+    def agent_names(owner: str) -> list[str]:
+        return [f"{owner}_position", *(f"{owner}_facing_{facing}" for facing in FACINGS), *item_names(owner)]
 
     ingredients = [f"ingredient_{number}" for number in range(ingredient_types)]
     static = ["wall", "goal", "pot", "recipe_indicator", "button", "plate_pile"]
     piles = [f"pile_{number}" for number in range(ingredient_types)]
     last = ["pot_timer", "delivery"] if delivery else ["pot_timer"]
-    return (*agent("self"), *agent("other"), *static, *piles, *item("item"), *item("recipe"), *last)
+    return (
+        *agent_names("self"),
+        *agent_names("other"),
+        *static,
+        *piles,
+        *item_names("item"),
+        *item_names("recipe"),
+        *last,
+    )
 
 
-CANONICAL_CHANNELS: tuple[str, ...] = _names(CANONICAL_TYPES, True)
+CANONICAL_CHANNELS: tuple[str, ...] = _list_channels(CANONICAL_TYPES, True)
 """Names of the 46 canonical channels, in order, for four ingredient types and the delivery indicator."""
 
 
 def channel_names(layout: Layout) -> tuple[str, ...]:
     """Return the names of a layout's C own channels, in order; the docstring of `observe` explains the channels."""
-    return _names(layout.ingredient_types, layout.indicates_delivery)
+    return _list_channels(layout.ingredient_types, layout.indicates_delivery)
 
 
 @lru_cache(maxsize=64)
@@ -50,7 +58,7 @@ def canonical_positions(layout: Layout) -> np.ndarray:
     """Return the canonical position of each of a layout's own channels, int64 (C,), ascending.
 
     Raises:
-        OptionError: if an ingredient of the layout has no canonical channel, since no published layout has it.
+        OptionError: if an ingredient of the layout has no canonical channel, that is, if no published layout has it.
     """
     names = channel_names(layout)
     missing = [name for name in names if name not in CANONICAL_CHANNELS]

@@ -168,7 +168,7 @@ def stack_padded(parts: Sequence[Any], padding: Mapping[str, int]) -> Any:
             repeated recipe changes no decision of a scripted agent.
     """
 
-    def stacked(name: str, values: Sequence[Any]) -> Any:
+    def stack_field(name: str, values: Sequence[Any]) -> Any:
         if isinstance(values[0], tuple):
             return stack_padded(values, padding)
         shape = np.max([value.shape for value in values], axis=0).astype(int)
@@ -180,7 +180,7 @@ def stack_padded(parts: Sequence[Any], padding: Mapping[str, int]) -> Any:
         return found
 
     fields = zip(type(parts[0])._fields, zip(*parts, strict=True), strict=True)
-    return type(parts[0])(*(stacked(name, values) for name, values in fields))
+    return type(parts[0])(*(stack_field(name, values) for name, values in fields))
 
 
 def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = None) -> Tables:
@@ -215,7 +215,7 @@ def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = N
         ahead=ahead,
         faced=kinds[ahead] | layout.piles[ahead].astype(np.int32) << 8 | number[ahead].astype(np.int32) << 16,
         moves=layout.moves,
-        view=_view(layout, number.astype(int), pots, buttons),
+        view=_make_view(layout, number.astype(int), pots, buttons),
         own=_channel_bits(layout, layout.ingredient_types, layout.indicates_delivery),
         canonical=_channel_bits(layout, canonical, True),
         pots=np.array(layout.pots, np.uint8),
@@ -263,7 +263,7 @@ def _shortest_paths(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     return distance.astype(np.uint8), np.where((distance > 0) & (distance < far), step, STAY).astype(np.uint8)
 
 
-def _view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.ndarray:
+def _make_view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.ndarray:
     """Return the table `Tables.view`; `number`, int (cells,), is `Tables.number`."""
     words = {INDICATOR: 1, GOAL: 2, POT: 3 + number, BUTTON: 3 + pots + number}
     changing = np.select([layout.kinds == kind for kind in words], list(words.values()), 0)
@@ -274,31 +274,31 @@ def _view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.nda
     for bit, ingredient in enumerate(layout.ingredients):
         pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
         fixed |= pile.astype(np.int32) << (_PILES - FIXED_BIT + bit)
-    # Cells outside the map have changing word 0, which is always zero, no fixed bits, and a number that no cell has.
+    # Cells outside the map have no fixed bits, word 0 of the changing words, which is always zero, and number NOWHERE.
     packed = changing | fixed << 8 | np.arange(layout.cells) << CELL_BIT
     return np.where(layout.window >= 0, packed[layout.window], NOWHERE << CELL_BIT).astype(np.int32)
 
 
 def _channel_bits(layout: Layout, types: int, delivery: bool) -> ChannelBits:
-    """Return the bits of the channels for `types` ingredient types, with or without delivery; empty for 0 types."""
+    """Return the bits of the channels for `types` ingredient types and `delivery`; empty arrays if `types` is 0."""
     order = {ingredient: number for number, ingredient in enumerate(layout.ingredients)}
 
-    def by_type(first: int, width: int, mask: int) -> list[tuple[int, int]]:
+    def ingredient_bits(first: int, width: int, mask: int) -> list[tuple[int, int]]:
         return [(first + width * order[i], mask) if i in order else (0, 0) for i in range(types)]
 
-    def item(first: int) -> list[tuple[int, int]]:
-        return [(first, 1), (first + 1, 1), *by_type(first + 2, 2, 3)]
+    def item_bits(first: int) -> list[tuple[int, int]]:
+        return [(first, 1), (first + 1, 1), *ingredient_bits(first + 2, 2, 3)]
 
-    agent = [(0, 1), *((1 + facing, 1) for facing in range(4)), *item(5)]
+    agent = [(0, 1), *((1 + facing, 1) for facing in range(4)), *item_bits(5)]
     bits = [
         *agent,
         *((AGENT_BITS + shift if mask else 0, mask) for shift, mask in agent),
         *((FIXED_BIT + bit, 1) for bit in range(len(_STATIC))),
-        *by_type(_PILES, 1, 1),
-        *item(0),
+        *ingredient_bits(_PILES, 1, 1),
+        *item_bits(0),
         (0, 0),  # a recipe never sets the channels plate and cooked
         (0, 0),
-        *by_type(RECIPE_BIT, 2, 3),
+        *ingredient_bits(RECIPE_BIT, 2, 3),
         (TIMER_BIT, 31),
         *([(DELIVERY_BIT, int(layout.indicates_delivery))] if delivery else []),
     ]

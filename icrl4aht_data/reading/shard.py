@@ -144,7 +144,10 @@ class Shard:
             raise self._read_error(error) from error
         offset, length = self.table["offset"], self.table["size"]
         if int(length.sum(dtype=np.int64)) > size >= int((offset + length).max(initial=0)):
-            raise ShardMismatchError(f"{self.path}: some of its {size} bytes belong to two chunks of the chunk table")
+            raise ShardMismatchError(
+                f"{self.path}: some of its {size} bytes belong to two chunks of the chunk table; "
+                f"fetch meta/ and the shard again"
+            )
         beyond = np.flatnonzero((offset > size) | (length > np.maximum(size, offset) - offset))
         if len(beyond):
             raise ShardTruncatedError(

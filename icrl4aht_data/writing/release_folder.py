@@ -65,7 +65,7 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
                     shutil.rmtree(leftover, ignore_errors=True)
                 try:
                     new.mkdir()
-                    with explain_full_disk(target):  # measures the free space before `new` is removed
+                    with explain_full_disk(target):  # the error states the free space before `new` is removed
                         yield new
                     check_target(target, overwrite, sources)
                     _replace(target, new, old)
