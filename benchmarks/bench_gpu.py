@@ -250,7 +250,7 @@ def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) ->
     compile_seconds = time.perf_counter() - started
     episodes = play_episodes(prepared)
     filling, shortest = -(-context // sizes.episode_steps), 2 * -(-context // 5 // sizes.episode_steps)
-    for _ in islice(episodes, filling):  # fills the windows; from then on, they regularly drop a fifth
+    for _ in islice(episodes, filling):  # fills the windows; full windows drop a fifth of their steps
         pass
     seconds = seconds_of_calls(partial(next, episodes), sizes.seconds, least=max(3, shortest))
     streams, episode_seconds = len(tasks) * seeds, statistics.mean(seconds)

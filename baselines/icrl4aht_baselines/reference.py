@@ -156,7 +156,7 @@ def check_learns_from_teacher(name: str) -> None:
     if not RECIPES[name].data:
         taught = ", ".join(each for each, recipe in RECIPES.items() if recipe.data)
         raise OptionError(
-            f"{name} does not learn from a teacher's histories; leave out {name}, or choose one of {taught}"
+            f"{name} does not learn from a teacher's histories; leave out --teacher, or choose another --name: {taught}"
         )
 
 
