@@ -207,7 +207,7 @@ class Dataset(Selection):
     def plot(self) -> Picture:
         """Return a plot of returns by episode, source and layout, which notebooks display.
 
-        This reads the rewards of all selected histories.
+        Plotting reads the rewards of all selected histories.
 
         Raises:
             OptionError: if matplotlib is not installed.
@@ -286,7 +286,7 @@ class Dataset(Selection):
         }
 
     def environment_parameters(self, history_id: int) -> dict[str, Any]:
-        """Return the parameters that rebuild the environment of a history: layout names, map, recipes, episode lengths.
+        """Return the parameters needed to rebuild a history's environment: layout names, map, recipes, episode lengths.
 
         Args:
             history_id: a history of the release, whether selected or not.
@@ -303,7 +303,7 @@ class Dataset(Selection):
         }
 
     def recover_teammate(self, history_id: int, episode: int = 0) -> dict[str, Any]:
-        """Return the parameters that rebuild the teammate of a history.
+        """Return the parameters needed to rebuild a history's teammate.
 
         Args:
             history_id: a history of the release, whether selected or not.

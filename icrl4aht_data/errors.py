@@ -1,4 +1,4 @@
-"""Exceptions of this package, which share one base class, and its warnings.
+"""Exceptions of this package, with one base class, and warnings of this package.
 
 An error's message names the file or value, what was expected, what was found, and what to do next.
 """
@@ -90,7 +90,7 @@ class FormatTooOldError(ReleaseError):
 
 
 class RemoteError(ReleaseError, OSError):
-    """A remote failed after all retries, or returned content that differs from its manifest.
+    """A remote request failed after all retries, or the fetched file differs from the release's manifest.
 
     Args:
         message: the error message, which includes the address.

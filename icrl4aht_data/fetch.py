@@ -120,7 +120,7 @@ class Remote(ReleaseLocation):
         return self.url
 
     def file(self, name: str) -> Path:
-        self.fetch([name])  # also checks the hash
+        self.fetch([name])  # `fetch` also checks the hash
         return self.path(name)
 
     def fetch(self, names: Iterable[str], advance: Advance | None = None, again: bool = False) -> None:
@@ -153,7 +153,7 @@ class Remote(ReleaseLocation):
             if not self.in_hub_cache:  # the Hub's client locks its own cache
                 stack.enter_context(disk.process_lock(disk.lock_path(self.folder)))
                 absent = [name for name in absent if again or not self.is_downloaded(name)]
-                for left in self.folder.glob(".partial-*"):  # left by a killed process
+                for left in self.folder.glob(".partial-*"):  # left by a killed download
                     shutil.rmtree(left, ignore_errors=True)
                 scratch = Path(stack.enter_context(TemporaryDirectory(prefix=".partial-", dir=self.folder)))
             stack.enter_context(self.client.connect())
@@ -170,7 +170,7 @@ class Remote(ReleaseLocation):
         """Download a file, and move it to its final path if its hash is the one in the manifest."""
         address, target = f"{self.url}/{name}", self.path(name)
         if scratch is None:
-            _remove_from_cache(target)  # so that the client downloads the file
+            _remove_from_cache(target)  # else the client would keep the cached file
         most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else disk.LARGEST
         path = _fetch_with_retries(self.client, address, name, scratch, advance, most)
         size, found = path.stat().st_size, disk.file_hash(path)
@@ -231,7 +231,7 @@ def _unset_text() -> str:
 def _fetch_with_retries(
     client: HubClient | FsspecClient, address: str, name: str, scratch: Path | None, advance: Advance, most: int
 ) -> Path:
-    """Download a file of at most `most` bytes, with retries; the calls of `advance` add up to the file's size."""
+    """Download a file of at most `most` bytes, with retries; the numbers given to `advance` add up to its size."""
     arrived = 0
 
     def count(size: int) -> None:
@@ -314,7 +314,7 @@ def _open_address(address: str, to: Path | None) -> Remote:
     check_credentials(address)
     client, url = FsspecClient(address), without_credentials(address).rstrip("/")
     base = data_folder() / f"{re.sub(r'[^A-Za-z0-9.]+', '-', url)[:80]}-{disk.short_hash(url.encode(), 8)}"
-    latest = base / "latest"  # contains the version found when the address was last opened
+    latest = base / "latest"  # file with the name of the version opened last
     if offline_switches():
         path = (to or base / (latest.read_text() if latest.is_file() else "none")) / MANIFEST
         if not path.is_file():
@@ -333,7 +333,7 @@ def _open_address(address: str, to: Path | None) -> Remote:
 
 
 def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | None) -> tuple[Path, bytes]:
-    """Download a release's manifest, and return its path and content; without a manifest there is no release."""
+    """Download a release's manifest, and return the manifest's path and content; a missing one is an error."""
     address = f"{url}/{MANIFEST}"
     try:
         with client.connect():

@@ -152,7 +152,7 @@ def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: 
 
 
 def check_structure(shard: Shard, values: bool = False) -> list[str]:
-    """Return faults in the bytes between chunks, and differences between libhdf5 and `Shard` in reading the file.
+    """Return faults in the bytes between chunks, and differences between what libhdf5 and `Shard` read from the file.
 
     Args:
         shard: the shard.
@@ -161,7 +161,7 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
     ordered = np.sort(shard.table, order="offset")
     stops, starts = (ordered["offset"] + ordered["size"]).tolist(), ordered["offset"].tolist()
     size = shard.path.stat().st_size
-    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // METADATA_ROW_BYTES  # as many rows as the writer makes
+    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // METADATA_ROW_BYTES  # the most rows that the writer makes
     faults, between = [], np.flatnonzero(shard.table["rows"] == 0).tolist()
     if len(ordered) > most or [0, *stops] != [*starts, size]:
         faults, between = [f"the chunk table does not cover the file's {size} bytes, each once"], []

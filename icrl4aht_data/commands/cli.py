@@ -137,7 +137,7 @@ def run(command: click.Command) -> None:
     If the reader of a pipe exits (`| head`), the command stops quietly with exit code 1. Output to a stream that is
     closed from the start (`>&-`) is dropped.
     """
-    for name in ("stdout", "stderr"):  # so that no opened file gets the descriptor of a closed stream
+    for name in ("stdout", "stderr"):  # else a file opened later gets the descriptor 1 or 2
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     try:

@@ -139,7 +139,7 @@ def show(
     console = Console(markup=False, highlight=False)
     if history_id is None:
         console.print(facts.pop("summary"), "", layout_table(dataset), "", sep="\n")
-        del facts["layouts"]  # the table shows the layouts
+        del facts["layouts"]  # already shown in the table
     else:
         console.print(repr(dataset[0]), "", sep="\n")
     console.print(*fact_lines(facts), sep="\n")
@@ -191,7 +191,7 @@ def browse(
     all episodes fit, the page has some episodes of each history, including the first and the last, and says which. A
     release of observations cannot be shown, since it has no states to draw.
     """
-    with suppress(OSError), out.open("rb") as stream:  # a page of this command may be replaced
+    with suppress(OSError), out.open("rb") as stream:  # a page that `browse` wrote may be replaced
         overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
     check_output(out, overwrite)
     matching = load_icrl4aht(root, **filters)

@@ -1,4 +1,4 @@
-"""Preparation of a release for publication: adds a card, figures, Parquet files and Croissant metadata."""
+"""Preparation of a release for publication, with a card, figures, Parquet files and Croissant metadata."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def check_valid(root: Path, advance: NamedProgress = lambda what, done, total: N
         ReleaseError: if a problem is found; the message names the first three.
     """
     if not (root / MANIFEST).exists():
-        read_info(root)  # its error says that the folder is not a release
+        read_info(root)  # raises an error that names the problem if the folder is not a release
     report = verify_release(root, advance=advance)
     if not report.ok:
         found = first_problems([f"{finding.file}: {finding.problem}" for finding in report.findings])

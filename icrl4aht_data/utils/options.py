@@ -1,8 +1,8 @@
-"""Option classes, whose annotations define types, bounds and help texts, and checks of single arguments.
+"""Option classes (dataclasses whose annotations define types, bounds and help texts), and checks of single arguments.
 
-An option class is a dataclass that checks itself, so the command line (`icrl4aht_data.commands.dataclass_options`),
-TOML and JSON files and Python code have the same bounds. Modules with option classes do not import JAX, to keep
-`--help` fast.
+An option class checks its values, so the bounds are the same on the command line
+(`icrl4aht_data.commands.dataclass_options`), in TOML and JSON files and in Python code. Modules with option classes do
+not import JAX, to keep `--help` fast.
 
     @dataclass(frozen=True)
     class Options:
