@@ -145,13 +145,13 @@ def check_choice(what: str, found: object, valid: Iterable[str]) -> None:
         UnknownNameError: if the value is not valid; the message lists the valid names and suggests the nearest.
     """
     if not isinstance(found, str) or found not in tuple(valid):  # `in` would fail for an array
-        raise unknown(what, found, valid)
+        raise unknown_name(what, found, valid)
 
 
 _LISTED, _COMPARED = 50, 1000  # maximum number of valid names to list, and to compare with the wrong one
 
 
-def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:
+def unknown_name(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:
     """Return the error for an unknown name, which lists the valid names and suggests the nearest."""
     names = list(dict.fromkeys(valid))
     by_small_letters = {name.casefold(): name for name in reversed(names[:_COMPARED])}

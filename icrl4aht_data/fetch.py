@@ -37,7 +37,7 @@ from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import check_against_manifest, read_manifest
 from icrl4aht_data.format.schema import INDEX_FILES, MANIFEST, PARQUET_EPISODES
 from icrl4aht_data.utils import files as disk
-from icrl4aht_data.utils.progress import counted, progress_bars
+from icrl4aht_data.utils.progress import bar_updater, progress_bars
 from icrl4aht_data.utils.system import data_folder
 
 _HUB = re.compile(r"hf://datasets/(?P<repo>[\w.-]+/[\w.-]+)(?:@(?P<revision>[^@]+))?/?")
@@ -84,7 +84,7 @@ class ReleaseLocation:
             check_against_manifest(self.folder, [name])
         return self.path(name)
 
-    def below(self, name: str) -> Path:
+    def fetch_folder(self, name: str) -> Path:
         """Download and check the files of a folder, which need not exist, and return the path of the folder.
 
         Raises:
@@ -144,7 +144,7 @@ class Remote(ReleaseLocation):
         if absent and offline_switches():
             listed = ", ".join(absent)
             raise OfflineError(
-                f"{self.url}: offline, but these files are missing or have changed: {listed}; {_unset_text()}"
+                f"{self.url}: offline, but these files are missing or have changed: {listed}; {_offline_advice()}"
             )
         if not absent:
             return
@@ -160,7 +160,7 @@ class Remote(ReleaseLocation):
             if advance is None:
                 size = sum(self._shard_sizes.get(name, 0) for name in absent if name.startswith("data/"))
                 show = stack.enter_context(progress_bars(quiet=not size, of_bytes=True))
-                advance = counted(show, "download", size)
+                advance = bar_updater(show, "download", size)
             pool = stack.enter_context(ThreadPoolExecutor(THREADS))
             stack.callback(pool.shutdown, cancel_futures=True)
             for file in as_completed([pool.submit(self._fetch_file, name, scratch, advance) for name in absent]):
@@ -223,7 +223,7 @@ class Remote(ReleaseLocation):
         return read_info(self.folder).shards
 
 
-def _unset_text() -> str:
+def _offline_advice() -> str:
     """Return advice for an error in offline mode: the environment variables to unset."""
     return f"unset {' and '.join(offline_switches())} to download"
 
@@ -318,7 +318,9 @@ def _open_address(address: str, to: Path | None) -> Remote:
     if offline_switches():
         path = (to or base / (latest.read_text() if latest.is_file() else "none")) / MANIFEST
         if not path.is_file():
-            raise OfflineError(f"{url}: offline, and this release is not downloaded to {path.parent}; {_unset_text()}")
+            raise OfflineError(
+                f"{url}: offline, and this release is not downloaded to {path.parent}; {_offline_advice()}"
+            )
         text = path.read_bytes()
     else:
         with TemporaryDirectory() as scratch:
@@ -340,7 +342,7 @@ def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | 
             path = _fetch_with_retries(client, address, MANIFEST, scratch, lambda size: None, disk.TEXT_BYTES)
     except RemoteError as error:
         if error.missing and offline_switches():
-            raise OfflineError(f"{url}: offline, and this release is not downloaded; {_unset_text()}") from None
+            raise OfflineError(f"{url}: offline, and this release is not downloaded; {_offline_advice()}") from None
         if error.missing:
             raise RootNotFoundError(f"{url}: no release at this address, expected {MANIFEST}: {error}") from None
         raise
@@ -424,7 +426,7 @@ def plan_download(
     present = {name: remote.path(name).stat().st_size for name in names if remote.path(name).exists()}
     sizes = {name: index.info.shards[name] for name in names if name in index.info.shards}
     sizes = present | sizes | remote.sizes(name for name in names if name not in sizes and name not in present)
-    compared, changed = counted(advance, "compare", sum(present.values())), []
+    compared, changed = bar_updater(advance, "compare", sum(present.values())), []
     for name, size in present.items():
         if not remote.is_downloaded(name, by_hash=True):
             changed.append(name)

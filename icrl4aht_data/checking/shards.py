@@ -60,7 +60,9 @@ def check_history(
     try:
         step_bytes = sum(field.element(layout, info.kind).itemsize for field in entry.stored_fields(info.kind))
         if (size := _COPIES * entry.T * step_bytes) > free_memory():
-            raise OptionError(f"checking this history takes {size / 1e9:.3g} GB of memory, more than is free")
+            raise OptionError(
+                f"checking this history takes {size / 1e9:.3g} GB of memory, more than is free; use a machine with more"
+            )
         for fault in _history_faults(history, layout, info.environment.kept_steps, deep=report.level == "deep"):
             report.add(entry.shard, f"history {entry.history_id}: {fault}")
         arrays = (history.read(name) for name in (record_field(info.kind).name, "actions"))
@@ -223,4 +225,4 @@ def _value_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
             continue  # the damage is already reported, and libhdf5 must not inflate the chunk
         theirs = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
         if not np.array_equal(theirs, ours):
-            yield f"history {entry.history_id}: HDF5 reads other values of {field.name} than we do"
+            yield f"history {entry.history_id}: libhdf5 and this package read different values of {field.name}"

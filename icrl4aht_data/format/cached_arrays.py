@@ -99,7 +99,7 @@ def _open_arrays(folder: Path) -> dict[str, np.ndarray] | None:
         for name, described in json.loads((folder / _CONTENTS).read_text(encoding="utf-8")).items():
             path = folder / f"{name}.npy"
             array = np.lib.format.open_memmap(path, mode="r")
-            if _describe(array) != described or array.offset + array.nbytes != path.stat().st_size:
+            if _dtype_and_shape(array) != described or array.offset + array.nbytes != path.stat().st_size:
                 return None
             arrays[name] = np.asarray(array)
     except (OSError, ValueError, AttributeError):
@@ -109,7 +109,7 @@ def _open_arrays(folder: Path) -> dict[str, np.ndarray] | None:
     return arrays
 
 
-def _describe(array: np.ndarray) -> list:
+def _dtype_and_shape(array: np.ndarray) -> list:
     return [array.dtype.str, list(array.shape)]
 
 
@@ -119,7 +119,7 @@ def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> dict[s
     new.mkdir()
     build(new)
     paths = sorted(new.glob("*.npy"))
-    contents = {path.stem: _describe(np.lib.format.open_memmap(path, mode="r")) for path in paths}
+    contents = {path.stem: _dtype_and_shape(np.lib.format.open_memmap(path, mode="r")) for path in paths}
     (new / _CONTENTS).write_text(json.dumps(contents), encoding="utf-8")
     for _ in range(3):
         arrays = _open_arrays(folder)

@@ -72,7 +72,9 @@ def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
             raise IndexFormatError(f"{path}, line {number}: {name!r} is listed twice; fetch the release again")
         twin = folded.setdefault(name.casefold(), name)
         if twin != name:
-            raise IndexFormatError(f"{path}, line {number}: {name!r} and {twin!r} are the same file on some systems")
+            raise IndexFormatError(
+                f"{path}, line {number}: {name!r} and {twin!r} are the same file on some systems: warn the publisher"
+            )
         listed[name] = digest
     return MappingProxyType(listed)
 

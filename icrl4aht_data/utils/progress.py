@@ -49,7 +49,7 @@ def progress_bars(quiet: bool = False, unit: str = "", of_bytes: bool = False) -
         yield show
 
 
-def counted(show: Callable[..., None], name: str, total: int) -> Callable[[int], None]:
+def bar_updater(show: Callable[..., None], name: str, total: int) -> Callable[[int], None]:
     """Return a function that advances the bar `name` by a number; any thread may call the function."""
     done, lock = 0, threading.Lock()
 

@@ -107,15 +107,15 @@ CACHE_VARIABLE, DATA_VARIABLE = "ICRL4AHT_CACHE_DIR", "ICRL4AHT_DATA_DIR"
 
 
 def cache_folder() -> Path:
-    """Return the folder of cached arrays; ~/.cache/icrl4aht by default on Linux. See `CACHE_VARIABLE`."""
+    """Return the folder of cached arrays: $ICRL4AHT_CACHE_DIR if set, else ~/.cache/icrl4aht on Linux."""
     own = os.environ.get(CACHE_VARIABLE)
     return Path(own).expanduser() if own else platformdirs.user_cache_path("icrl4aht", appauthor=False)
 
 
 def data_folder() -> Path:
-    """Return the folder of fetched releases; ~/.local/share/icrl4aht by default on Linux.
+    """Return the folder of fetched releases: $ICRL4AHT_DATA_DIR if set, else ~/.local/share/icrl4aht on Linux.
 
-    The environment variable is read at each call. Unlike in the cache folder, no file is removed automatically.
+    Unlike in the cache folder, no file is removed automatically.
     """
     own = os.environ.get(DATA_VARIABLE)
     return Path(own).expanduser() if own else platformdirs.user_data_path("icrl4aht", appauthor=False)
