@@ -75,8 +75,8 @@ def build_release(
         for name, digest in kept.items():
             if digests.get(name) != digest:
                 raise ReleaseError(
-                    f"{source / name}: changed while it was copied; sha256 is now {digests.get(name)}; build the release "
-                    f"again"
+                    f"{source / name}: changed while it was copied; sha256 is now {digests.get(name)}; "
+                    f"build the release again"
                 )
         today = datetime.datetime.now(datetime.UTC).date()
         write_json(root / CROISSANT, croissant(root, digests, published or today))
