@@ -225,7 +225,7 @@ class OracleView:
 
     @cached_property
     def must_clear(self) -> Bool[Array, ""]:
-        """Whether the ego must take wrong soups out of pots."""
+        """Whether the ego must take soups of other recipes out of pots."""
         return self.risky | ((self.stock[0] == 0) & (jnp.min(self.plan_costs[:, 0]) == NEVER))
 
     @cached_property
@@ -247,7 +247,7 @@ class OracleView:
         """Pots in front of which the ego waits instead of interacting."""
         hand, mixed = self.scene.hand, self.contents + self.scene.hand
         completes = self.careful & (ingredient_count(mixed) == 3)
-        # Start a wrong or a second soup only while a right soup still needs at least WAIT_LIMIT steps.
+        # Start another soup only while a soup of the current recipe cooks for at least WAIT_LIMIT more steps.
         ahead = (mixed != self.recipes[0]) | (self.stock[0] > 0)
         spoils = ahead & ~jnp.any(self.right & (self.timers >= WAIT_LIMIT))
         leaves_it = (self.scene.partner_hand == hand) & (self.memory.calm < WAIT_LIMIT)
@@ -360,12 +360,12 @@ def _plate_subgoals(view: OracleView) -> list[Subgoal]:
     holds, building = view.scene.holds_plate, jnp.min(view.plan_costs) < NEVER
     right = view.right & ~view.teammate_pots
     soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
-    # If a soup is not done when the ego arrives, the ego waits. Each step of waiting costs as much as walking a step.
+    # If a soup is not done when the ego arrives, the ego waits. A step of waiting costs as much as a step of walking.
     rest = jnp.maximum(view.timers - view.pot_times, 0)
     return [
         # Plate the soup of the current recipe.
         Subgoal(holds & (soon | ~building), view.cost_at_pots(right, rest)),
-        # Empty a pot of a wrong soup.
+        # Take a soup of another recipe out of its pot.
         Subgoal(holds & (view.must_clear | ~building), view.cost_at_pots(view.full & ~view.right, rest)),
         # Put the plate down: no soup needs it, but a pot needs ingredients.
         Subgoal(holds, view.parking_cost),
@@ -423,7 +423,7 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
         Subgoal(builds & quick & ~view.risky, ingredients),
         # Fetch a plate in time for a soup of the current recipe.
         plate_subgoal(right & due),
-        # Take a wrong soup before the teammate serves it.
+        # Take a soup of another recipe before the teammate serves it.
         plate_subgoal(wrong & due & view.risky),
         # Fetch an ingredient to cook.
         Subgoal(builds, ingredients),
