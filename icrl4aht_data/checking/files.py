@@ -12,9 +12,8 @@ from icrl4aht_data.fetch import ReleaseLocation, Remote
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.manifest import META_FILE
 from icrl4aht_data.format.provenance import ProvenanceByTask
-from icrl4aht_data.format.schema import EXPERTS, INFO, MANIFEST, PROVENANCE, TEAMMATES
+from icrl4aht_data.format.schema import EXPERTS, INDEX_FILES, INFO, MANIFEST, PROVENANCE, TEAMMATES
 from icrl4aht_data.utils.files import LARGEST, file_hash, files_below, resolve_inside
 
 _HUB_FILES = (".gitattributes", ".cache/huggingface/")
@@ -49,13 +48,11 @@ def check_files(
         try:
             path = resolve_inside(root, name)
             size, right = path.stat().st_size, sizes.get(name)
-            if right is None and size > LARGEST:
-                report.add(name, f"expected at most {LARGEST:,} bytes, found {size:,}")
+            if size > LARGEST if right is None else size != right:
+                expected_size = f"at most {LARGEST:,}" if right is None else f"{right:,}"
+                report.add(name, f"expected {expected_size} bytes, found {size:,}")
                 continue
-            if right is not None and size != right:
-                report.add(name, f"expected {right:,} bytes, found {size:,}")
-                continue
-            found = listed[name] if quick and not META_FILE.fullmatch(name) else file_hash(path)
+            found = listed[name] if quick and name not in INDEX_FILES else file_hash(path)
         except (Icrl4ahtError, OSError) as error:
             report.add(name, str(error))
             continue
@@ -66,7 +63,7 @@ def check_files(
 
 
 def _recorded_sizes(root: Path, listed: Mapping[str, str]) -> dict[str, int]:
-    """Return the sizes of the shards in meta/info.json, by shard; empty if that file does not match the manifest."""
+    """Return shard -> bytes from meta/info.json; empty if meta/info.json does not match the manifest."""
     try:
         shards = read_info(root).shards
         return shards if file_hash(root / INFO) == listed.get(INFO) else {}
@@ -117,6 +114,6 @@ def check_remote_sizes(remote: Remote, index: Index, shards: list[str], report: 
         report.add("data", str(error))
         return
     for name, found in sizes.items():
-        expected = index.info.shards.get(name, found)  # `check_index` reports unknown names
+        expected = index.info.shards.get(name, found)  # `check_index` reports shards that are not in info.json
         if found != expected:
             report.add(name, f"expected {expected:,} bytes, found {found:,}")

@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 from icrl4aht_data.errors import ChunkTableError, IndexFormatError, UnsafePathError
 from icrl4aht_data.format.schema import EXPERTS, INDEX_FILES, MANIFEST, PARQUET_EPISODES, PARQUET_INDEX, TEAMMATES
-from icrl4aht_data.utils.files import atomic_write, checked_hash, file_hash, is_safe_path, read_text, resolve_inside
+from icrl4aht_data.utils.files import checked_hash, file_hash, is_safe_path, read_text, resolve_inside, write_atomically
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
@@ -36,12 +36,6 @@ _KNOWN = re.compile(
 content of a downloaded file such as .git/config, sitecustomize.py or x.pth."""
 
 
-META_FILE = re.compile(r"meta/[^/]+")
-"""Pattern of the files in meta/, except chunk tables. Opening a release checks their hashes."""
-
-_SOURCE_CARD = "meta/source_card.md"  # written only by earlier versions of this package
-
-
 @lru_cache(maxsize=16)
 def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
     """Parse a manifest, and return the SHA-256 of each file by path in the release; results are cached.
@@ -55,9 +49,9 @@ def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
         UnsafePathError: if a path points outside the release, or is not the path of a release's file.
     """
     if not text:
-        raise IndexFormatError(f"{path} is empty: expected a line for each file of the release; fetch it again")
+        raise IndexFormatError(f"{path} is empty: expected a line for each file of the release; download it again")
     if not text.endswith("\n"):
-        raise IndexFormatError(f"{path} is cut off: the last line does not end with a newline; fetch it again")
+        raise IndexFormatError(f"{path} is cut off: the last line does not end with a newline; download it again")
     listed: dict[str, str] = {}
     folded: dict[str, str] = {}  # names by lower-case name, to find names that are equal on disks that ignore case
     for number, line in enumerate(text.splitlines(), start=1):
@@ -78,7 +72,9 @@ def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
             raise IndexFormatError(f"{path}, line {number}: {name!r} is listed twice; fetch the release again")
         twin = folded.setdefault(name.casefold(), name)
         if twin != name:
-            raise IndexFormatError(f"{path}, line {number}: {name!r} and {twin!r} are the same file on some systems")
+            raise IndexFormatError(
+                f"{path}, line {number}: {name!r} and {twin!r} are the same file on some systems: warn the publisher"
+            )
         listed[name] = digest
     return MappingProxyType(listed)
 
@@ -118,15 +114,9 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
 
 
 def check_meta(root: Path) -> None:
-    """Check the files in meta/, except chunk tables, with `check_against_manifest`.
-
-    meta/source_card.md, which earlier versions of this package wrote, may be missing, since no code reads this file.
-    """
-    names = {name for name in read_manifest(root) if META_FILE.fullmatch(name)}
-    if not (root / _SOURCE_CARD).exists():
-        names.discard(_SOURCE_CARD)
-    names |= {name for name in INDEX_FILES if (root / name).exists()}
-    check_against_manifest(root, sorted(names))
+    """Check those of `INDEX_FILES` that are listed or present with `check_against_manifest`."""
+    listed = read_manifest(root)
+    check_against_manifest(root, sorted(name for name in INDEX_FILES if name in listed or (root / name).exists()))
 
 
 def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
@@ -145,5 +135,4 @@ def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
     if foreign:
         raise UnsafePathError(f"{root}: {foreign[0]!r} is not a file that a release may contain; remove it")
     lines = [f"{known.get(name) or file_hash(root / name)}  {name}\n" for name in names if name != MANIFEST]
-    with atomic_write(root / MANIFEST) as partial:
-        partial.write_text("".join(lines), encoding="utf-8")
+    write_atomically(root / MANIFEST, "".join(lines))

@@ -1,8 +1,8 @@
-"""Option classes, whose annotations define types, bounds and help texts, and checks of single arguments.
+"""Option classes (dataclasses whose annotations define types, bounds and help texts), and checks of single arguments.
 
-An option class is a dataclass that checks itself, so the command line (`icrl4aht_data.commands.dataclass_options`),
-TOML and JSON files and Python code have the same bounds. Modules with option classes do not import JAX, to keep
-`--help` fast.
+An option class checks its values, so the bounds are the same on the command line
+(`icrl4aht_data.commands.dataclass_options`), in TOML and JSON files and in Python code. Modules with option classes do
+not import JAX, to keep `--help` fast.
 
     @dataclass(frozen=True)
     class Options:
@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from icrl4aht_data.errors import OptionError, PositionError, PositionTypeError, unknown
+from icrl4aht_data.errors import OptionError, PositionError, PositionTypeError, unknown_name
 
 Count = Annotated[int, Meta(ge=1)]
 Natural = Annotated[int, Meta(ge=0)]
@@ -55,20 +55,19 @@ class Option(NamedTuple):
 
 
 @cache
-def option_hints(kind: type) -> dict[str, Any]:
-    """Return the annotations of those fields of a dataclass that are options, by field name."""
-    hints = get_type_hints(kind, include_extras=True)
-    return {name: hint for name, hint in hints.items() if any(isinstance(part, Option) for part in get_args(hint))}
-
-
-@cache
-def _checked_hints(kind: type) -> dict[str, Any]:
+def _hints_with(kind: type, *parts: Any) -> dict[str, Any]:
+    """Return the annotations of those fields of a dataclass that have a part of one of the given kinds, by name."""
     hints = get_type_hints(kind, include_extras=True)
     return {
         name: hint
         for name, hint in hints.items()
-        if any(isinstance(part, (Option, Meta)) or get_origin(part) is Literal for part in annotation_parts(hint))
+        if any(type(part) in parts or get_origin(part) in parts for part in annotation_parts(hint))
     }
+
+
+def option_hints(kind: type) -> dict[str, Any]:
+    """Return the annotations of those fields of a dataclass that are options, by field name."""
+    return _hints_with(kind, Option)
 
 
 def check_options(options: Any) -> None:
@@ -80,7 +79,7 @@ def check_options(options: Any) -> None:
         OptionError: if a value has another type or is out of bounds.
         UnknownNameError: if a value is not among the choices; the message lists the choices.
     """
-    for name, hint in _checked_hints(type(options)).items():
+    for name, hint in _hints_with(type(options), Option, Meta, Literal).items():
         value = getattr(options, name)
         converted = convert_option(name, value, hint)
         if isinstance(value, list):
@@ -102,7 +101,7 @@ def convert_option(name: str, value: Any, hint: Any, strict: bool = True) -> Any
     """
     choices = option_choices(hint)
     if choices and value not in choices and (value is not None or type(None) not in annotation_parts(hint)):
-        raise unknown(name, value, choices)
+        raise unknown_name(name, value, choices)
     try:
         converted = msgspec.convert(value, hint, strict=strict)
     except msgspec.ValidationError as error:
@@ -141,7 +140,7 @@ def replace_options(options: Options, values: Mapping[str, Any], where: str = ""
     changes = {}
     for name, value in values.items():
         if name not in known:
-            raise unknown("key", where + name, [where + each for each in known])
+            raise unknown_name("key", where + name, [where + each for each in known])
         before = getattr(instance, name)
         if dataclasses.is_dataclass(before) and not isinstance(value, Mapping):
             raise OptionError(f"{where}{name} = {value!r}: expected a table")
