@@ -117,8 +117,8 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
     had = old.hands[TEAMMATE]
     into_pot = jnp.sum(ingredient_count(new.pot_items)) > jnp.sum(ingredient_count(old.pot_items))
     put = (had >> 2 > 0) & (had & PLATE == 0) & (new.hands[TEAMMATE] == 0) & into_pot
-    seen = memory.seen + jnp.where(put, Scene.counts(had), 0)
-    fits = (Scene.counts(dishes) @ seen) / jnp.maximum(seen.sum(), 1)
+    seen = memory.seen + jnp.where(put, Scene.ingredient_counts(had), 0)
+    fits = (Scene.ingredient_counts(dishes) @ seen) / jnp.maximum(seen.sum(), 1)
     score = jnp.where(paid, 100.0, fits + 0.1 * memory.order) - 1000.0 * (refused | (dishes == _NO_DISH))
     idle = jnp.all(new.pot_items == 0) & (new.hands[EGO] == 0)
     change = idle | refused[memory.belief] | paid.any()

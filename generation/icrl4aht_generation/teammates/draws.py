@@ -166,8 +166,9 @@ def drawn_teammates(
     available = sum(map(len, queues))
     if count > available:
         raise OptionError(
-            f"{name}: {count} {_OF_SEED[base_seed]} teammates requested of {', '.join(families) or 'no family'}, with "
-            f"only {available} distinct draws; request fewer or name more families ({_usable_text(name, base_seed)})"
+            f"{name}: {count} {_OF_SEED[base_seed]} teammates requested from {', '.join(families) or 'no family'}, "
+            f"expected at most {available}, the number of distinct draws; request fewer, or name more families "
+            f"({_usable_text(name, base_seed)})"
         )
     turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]
     ranges = ranges_of(base_seed)
