@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, Unpack
@@ -24,14 +24,14 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.plotting import Picture, plot_learning_curves
 from icrl4aht_data.reading.episodes import Episode
-from icrl4aht_data.reading.history import Obs
-from icrl4aht_data.reading.selection import Filters, ReadOptions, Selection
+from icrl4aht_data.reading.history import Labels, Obs
+from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.reading.splitting import SPLIT_BY, SplitBy, choose_histories, choose_teammates
-from icrl4aht_data.sampling.ad import ADOptions, ADSampler
-from icrl4aht_data.sampling.base import warn_of_mixed_splits
-from icrl4aht_data.sampling.dpt import DPTOptions, DPTSampler
+from icrl4aht_data.sampling.ad import ADSampler
+from icrl4aht_data.sampling.base import SamplerOptions, warn_of_mixed_splits
+from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
 from icrl4aht_data.sampling.draws import draw_subset
 from icrl4aht_data.utils.options import check_int, check_number
 from icrl4aht_data.utils.system import usable_cores
@@ -47,11 +47,22 @@ MINI = Path(__file__).parent / "mini"
 def load_icrl4aht(
     root: str | Path | None = None,
     *,
+    split: FilterValues = None,
+    layout: FilterValues = None,
+    layout_family: FilterValues = None,
+    track: FilterValues = None,
+    teammate_family: FilterValues = None,
+    teammate_kind: FilterValues = None,
+    algorithm: FilterValues = None,
+    source: FilterValues = None,
+    label_view: FilterValues = None,
+    task_id: FilterValues = None,
+    learner: int | Sequence[int] | None = None,
+    min_expert_return: float | None = None,
     obs: Obs = "float32",
     cache: CacheMode = "auto",
     threads: int | None = None,
     channels: Channels = "own",
-    **filters: Unpack[Filters],
 ) -> Dataset:
     """Open a release and return a selection of its histories.
 
@@ -94,7 +105,21 @@ def load_icrl4aht(
         ReleaseError: if the release cannot be read.
     """
     options = ReadOptions(obs, cache, usable_cores() if threads is None else threads, channels)
-    return open_dataset(open_root(MINI if root is None else root), options).filter(**filters)  # type: ignore[arg-type]
+    dataset = open_dataset(open_root(MINI if root is None else root), options)
+    return dataset.filter(
+        split=split,
+        layout=layout,
+        layout_family=layout_family,
+        track=track,
+        teammate_family=teammate_family,
+        teammate_kind=teammate_kind,
+        algorithm=algorithm,
+        source=source,
+        label_view=label_view,
+        task_id=task_id,
+        learner=learner,
+        min_expert_return=min_expert_return,
+    )
 
 
 def open_dataset(location: ReleaseLocation, options: ReadOptions) -> Dataset:
@@ -341,7 +366,16 @@ class Dataset(Selection):
             raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self.tasks)
         return self.tasks[entry.task_id]
 
-    def ad(self, *, batch_size: int, length: int, **options: Unpack[ADOptions]) -> ADSampler:
+    def ad(
+        self,
+        *,
+        batch_size: int,
+        length: int,
+        every: int = 1,
+        labels: Labels | None = None,
+        families: bool = False,
+        **options: Unpack[SamplerOptions],
+    ) -> ADSampler:
         """Return a sampler of windows of `length` steps for Algorithm Distillation; see `ADSampler` for the options.
 
         Warns:
@@ -349,9 +383,20 @@ class Dataset(Selection):
             WeakLabelsWarning: see `ADSampler`.
         """
         warn_of_mixed_splits(self)
-        return ADSampler(self, batch_size=batch_size, length=length, **options)
+        return ADSampler(
+            self, batch_size=batch_size, length=length, every=every, labels=labels, families=families, **options
+        )
 
-    def dpt(self, *, batch_size: int, context: int, **options: Unpack[DPTOptions]) -> DPTSampler:
+    def dpt(
+        self,
+        *,
+        batch_size: int,
+        context: int,
+        order: ContextOrder = "contiguous",
+        labels: Labels = "expert",
+        queries: int = 1,
+        **options: Unpack[SamplerOptions],
+    ) -> DPTSampler:
         """Return a sampler of queries with contexts of `context` transitions for Decision-Pretrained Transformers.
 
         See `DPTSampler` for the options.
@@ -361,7 +406,9 @@ class Dataset(Selection):
             WeakLabelsWarning: see `DPTSampler`.
         """
         warn_of_mixed_splits(self)
-        return DPTSampler(self, batch_size=batch_size, context=context, **options)
+        return DPTSampler(
+            self, batch_size=batch_size, context=context, order=order, labels=labels, queries=queries, **options
+        )
 
 
 def _check_episode(entry: Entry, episode: int) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self, TypedDict, overload
+from typing import TYPE_CHECKING, Any, Self, overload
 
 import numpy as np
 
@@ -31,23 +31,6 @@ COUNTED = ("split", "source", "layout", "teammate_family", "teammate_kind", "lab
 
 FilterValues = str | Sequence[str] | None
 """Filter on an index field: one value, several values, or None for any."""
-
-
-class Filters(TypedDict, total=False):
-    """Filters of `load_icrl4aht`, which describes each."""
-
-    split: FilterValues
-    layout: FilterValues
-    layout_family: FilterValues
-    track: FilterValues
-    teammate_family: FilterValues
-    teammate_kind: FilterValues
-    algorithm: FilterValues
-    source: FilterValues
-    label_view: FilterValues
-    task_id: FilterValues
-    learner: int | Sequence[int] | None
-    min_expert_return: float | None
 
 
 @dataclass(frozen=True)

@@ -61,14 +61,6 @@ class ADBatch(NamedTuple, Generic[A]):
     __repr__ = batch_repr
 
 
-class ADOptions(SamplerOptions, total=False):
-    """Options of `ADSampler` that have defaults."""
-
-    every: int
-    labels: Labels | None
-    families: bool
-
-
 class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torch.Tensor]"]):
     """A sequence of batches for Algorithm Distillation, each a pure function of (selection, options, seed, i).
 

@@ -58,14 +58,6 @@ class DPTBatch(NamedTuple, Generic[A]):
     __repr__ = batch_repr
 
 
-class DPTOptions(SamplerOptions, total=False):
-    """Options of `DPTSampler` that have defaults."""
-
-    order: ContextOrder
-    labels: Labels
-    queries: int
-
-
 class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[torch.Tensor]"]):
     """A sequence of batches of queries with contexts, each a pure function of (selection, options, seed, i).
 
