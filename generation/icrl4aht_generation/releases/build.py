@@ -82,7 +82,7 @@ def build_releases(
     run_jobs(jobs, out, console, options)
     tasks = list({work.task.task_id: work.task for work in units}.values())
     artefacts, releases = out / "artefacts", [out / kind for kind in kinds]
-    with process_lock(out / _PACKING_LOCK):  # other processes with this folder pack the same releases
+    with process_lock(out / _PACKING_LOCK):  # other processes may pack the same releases
         facts = teammate_facts(tasks, artefacts, suite, headroom)
         for kind, release in zip(kinds, releases, strict=True):
             with progress_bars(unit="tasks") as show:
