@@ -29,7 +29,7 @@ from icrl4aht_data.benchmark.facts import (
     check_membership,
     kind_family,
 )
-from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, check_choice, unknown
+from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, check_choice, unknown_name
 from icrl4aht_data.overcooked.layouts import Layout, get_layout, with_recipes
 from icrl4aht_data.utils.files import is_safe_path, json_hash, parse_json, read_lines
 
@@ -220,7 +220,7 @@ class _RlTheta(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _Teammate(msgspec.Struct, forbid_unknown_fields=True):
-    """Fields of a task's entry `teammate`; manifests of the published code may also have the agent's slot."""
+    """Fields of a task's `teammate`; manifests of the published code may also have the teammate's slot."""
 
     kind: Literal["heuristic", "rl"]
     family: str
@@ -281,7 +281,7 @@ def check_teammate(teammate: dict[str, Any]) -> None:
     family, is_heuristic = kind_family(found.family), found.kind == "heuristic"
     if family is None or (family == "rl") == is_heuristic:
         kinds = (*HEURISTIC_KINDS, *TEAMMATE_PLUGINS.names) if is_heuristic else ALGORITHMS
-        raise unknown(f"{found.kind} family", found.family, kinds)
+        raise unknown_name(f"{found.kind} family", found.family, kinds)
     if not is_heuristic:
         checkpoint = _convert(found.theta, _RlTheta, "teammate.theta: ").checkpoint
         if not is_safe_path(checkpoint):

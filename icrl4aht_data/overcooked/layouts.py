@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, unknown_name
 from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.cells import (
     BUTTON,
@@ -43,7 +43,7 @@ from icrl4aht_data.utils.options import convert_option
 from icrl4aht_data.utils.plugins import Plugins
 
 _LETTERS = {"W": WALL, "X": GOAL, "P": POT, "R": INDICATOR, "L": BUTTON, "B": PLATES, " ": EMPTY, "A": EMPTY}
-_type_hints = cache(get_type_hints)  # resolving them takes as long as all checks of a layout
+_type_hints = cache(get_type_hints)  # cached, since resolving type hints takes as long as all checks of a layout
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ class Layout:
 
     @cached_property
     def ingredients(self) -> tuple[int, ...]:
-        """Ids of the ingredients that have a pile, ascending; bits 2 + 2k, 3 + 2k of an item count the k-th."""
+        """Ids of the ingredients that have a pile, ascending; bits 2 + 2k and 3 + 2k of an item byte count the k-th."""
         return tuple(sorted({int(c) for c in "".join(self.rows) if c in digits}))
 
     @cached_property
@@ -166,7 +166,7 @@ class Layout:
 
     @cached_property
     def rooms(self) -> tuple[np.ndarray, np.ndarray]:
-        """Floor cells that the ego can reach, and floor cells that the teammate can reach; uint8, ascending."""
+        """Pair of uint8 arrays: floor cells that the ego can reach, and that the teammate can reach; ascending."""
         first, second = (self._reachable(cell) for cell in self.agent_cells)
         return first, second
 
@@ -202,7 +202,7 @@ class Layout:
         here = np.arange(self.cells, dtype=np.uint8)[:, None]
         target = self.ahead[:, FACING_OF]
         moved = np.where(self.walkable[:, None] & self.walkable[target], target, here)
-        return np.concatenate([moved, here, here], axis=1)  # the actions stay and interact do not move
+        return np.concatenate([moved, here, here], axis=1)  # `stay` and `interact` do not move the agent
 
     @cached_property
     def pots(self) -> tuple[int, ...]:
@@ -325,12 +325,12 @@ def get_layout(name: str) -> Layout:
         PluginError: if a registered layout cannot be used.
     """
     if not isinstance(name, str):
-        raise unknown("layout", name, all_layout_names())
+        raise unknown_name("layout", name, all_layout_names())
     layout = LAYOUTS.get(name) or _BY_ALIAS.get(name) or _RELEASE_LAYOUTS.get(name) or _manifest_layouts().get(name)
     if layout is not None:
         return layout
     if name not in LAYOUT_PLUGINS.names:
-        raise unknown("layout", name, all_layout_names())
+        raise unknown_name("layout", name, all_layout_names())
     layout = LAYOUT_PLUGINS.load(name, Layout)
     if {layout.name, layout.alias} != {name}:
         raise LAYOUT_PLUGINS.error(
