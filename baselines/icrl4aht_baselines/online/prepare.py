@@ -89,6 +89,7 @@ def prepare_play(
             "channels": "canonical",
             "obs_shape": list(observation_shape(layouts[0], True)),
             "groups": {group.name: len(group.teammates) for group in groups},
+            "searched": sorted({group.label for group in groups if group.searched}),
         },
         "trained_on": _training_record(dataset, tasks, played, labels),
     }
@@ -184,11 +185,17 @@ def _task_groups(
     total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
     rearranged = {layout: REARRANGED_SHARE * shares[layout.name] for layout in heuristics if play.rearranged}
     fixed = round(tasks * total / (total + sum(rearranged.values())))
-    groups = make_groups(everywhere, fixed, shares, hidden)
+    searched = [layout for layout, _ in teammates if _wants_hidden_dish(layout)]
+    groups = make_groups(everywhere, fixed, shares, hidden, searched)
     for layout, share in rearranged.items():
         count = round((tasks - fixed) * share / sum(rearranged.values()))
         groups += _rearranged_groups(layout, heuristics[layout], count, play.rearranged, layout.name in hidden)
     return groups
+
+
+def _wants_hidden_dish(layout: Layout) -> bool:
+    """Return whether the tasks on a layout always want one of its dishes, which the ego does not see."""
+    return layout.recipes != get_layout(layout.name).recipes and not layout.shows_recipe
 
 
 def _heuristic_teammates(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, Policy]]]:
