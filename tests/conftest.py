@@ -21,7 +21,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.writing.published import from_published, to_published
 from tests.helpers.commands import run_cli
 from tests.helpers.paths import ROOT
-from tests.helpers.published_files import KEPT, publish
+from tests.helpers.published_files import KEPT, write_published_files
 from tests.helpers.random_releases import random_release
 from tests.helpers.tiny import TINY
 from tests.helpers.two_sources import two_source_release
@@ -33,8 +33,8 @@ MEMORY_TO_FREE = 1200 * 2**20
 SharedFolder = Callable[[str, Callable[[Path], object]], Path]
 COMPILATION_CACHE: dict[str, Any] = {
     "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".cache" / "jax"),
-    "jax_compilation_cache_max_size": 2 * 2**30,  # JAX locks a folder with a size limit; processes can then share it
-    "jax_persistent_cache_min_compile_time_secs": 0.1,  # warm runs take a third less CPU time than with 0.5
+    "jax_compilation_cache_max_size": 2 * 2**30,  # with a limit, JAX locks the folder, so processes can share the cache
+    "jax_persistent_cache_min_compile_time_secs": 0.1,  # with 0.5, runs with a filled cache take 50% more CPU time
 }
 COSTLIEST = """
 collect notebooks wheel reference heuristics scripted rl2 suite generate run fetch gymnasium_env docs models trainer
@@ -50,19 +50,21 @@ QUICK_COMPILATION = (
 
 
 def pytest_configure() -> None:
-    """Compile quickly and cache compiled programs on disk, for this process, its subprocesses and later runs.
+    """Make JAX compile with few optimizations, and cache compiled programs on disk for subprocesses and later runs.
 
-    Most tests compile small programs to run them a few times. `JAX_DISABLE_MOST_OPTIMIZATIONS=0 make test` tests
-    optimized programs.
+    Compilation takes longer than running in most tests. `JAX_DISABLE_MOST_OPTIMIZATIONS=0 make test` tests optimized
+    programs.
     """
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] != "0":
         jax.config.update("jax_disable_most_optimizations", True)
         if QUICK_COMPILATION in os.environ.get("XLA_FLAGS", "").split() or is_xla_flag(QUICK_COMPILATION):
             os.environ["XLA_FLAGS"] = add_xla_flag(QUICK_COMPILATION)
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")  # tests expect a CPU's bits and tolerances
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")  # expected values and tolerances hold on CPUs only
     jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
-    os.environ.setdefault("PJRT_NPROC", "1")  # must be set before JAX starts; test profiles use one thread
+    os.environ.setdefault(
+        "PJRT_NPROC", "1"
+    )  # JAX reads this variable at its start; the profiles of tests use one thread
     for name, value in COMPILATION_CACHE.items():
         jax.config.update(name, value)
         os.environ[name.upper()] = str(value)
@@ -71,7 +73,7 @@ def pytest_configure() -> None:
 
 
 def _remove_unfinished_entries(folder: Path) -> None:
-    """Remove cache entries without an access-time file, left by killed processes; with them JAX fails to add more."""
+    """Remove cache entries without an access-time file, left by killed processes: JAX could not add other entries."""
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / ".lockfile"):
         for entry in folder.glob("*-cache"):
@@ -92,7 +94,7 @@ def free_compiled_programs() -> Iterator[None]:
     if psutil.Process().memory_info().rss > MEMORY_TO_FREE:
         jax.clear_caches()
         gc.collect()
-        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)(0)  # without this, glibc keeps freed memory
+        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)(0)  # glibc otherwise keeps freed memory
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -104,7 +106,10 @@ def temporary_cache(tmp_path_factory) -> None:
 
 @pytest.fixture(scope="session")
 def shared_folder(tmp_path_factory) -> SharedFolder:
-    """Return a function (name, make) that returns a folder; the first worker fills the folder by `make` (read-only)."""
+    """Return a function that returns the folder of a given name (read-only).
+
+    The first test worker that asks for a folder fills the folder by the given function.
+    """
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
@@ -122,7 +127,7 @@ def shared_folder(tmp_path_factory) -> SharedFolder:
 
 @pytest.fixture(scope="session")
 def lite(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """Return a lite release of random play, and the arrays written to it by history id (read-only)."""
+    """Return a lite release of random play, and a dict from history id to the written arrays (read-only)."""
     root = tmp_path_factory.mktemp("releases") / "lite"
     return root, random_release(root, "lite")
 
@@ -148,8 +153,8 @@ def two_sources(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]
 
 
 @pytest.fixture
-def damaged(lite, tmp_path) -> Path:
-    """Return a copy of the fixture `lite` that a test may damage."""
+def release_copy(lite, tmp_path) -> Path:
+    """Return a copy of the fixture `lite` that a test may change or damage."""
     root = tmp_path / "release"
     shutil.copytree(lite[0], root)
     return root
@@ -157,22 +162,22 @@ def damaged(lite, tmp_path) -> Path:
 
 @pytest.fixture(scope="session")
 def built(shared_folder) -> Path:
-    """Return a folder with tiny.toml and, in `a`, the lite and full releases generated from it (read-only)."""
+    """Return a folder with the profile tiny.toml and, in `a`, the releases generated from the profile (read-only)."""
 
-    def make(folder: Path) -> None:
+    def generate_releases(folder: Path) -> None:
         (folder / "tiny.toml").write_text(TINY)
         run_cli(
             "generate", "--profile", folder / "tiny.toml", "--out", folder / "a", "--kind", "lite", "--kind", "full"
         )
 
-    return shared_folder("built", make)
+    return shared_folder("built", generate_releases)
 
 
 @pytest.fixture(scope="session")
 def published_folder(tmp_path_factory) -> tuple[Path, list[dict[str, np.ndarray]]]:
     """Return small files in the published format, written by hand, and their arrays (read-only)."""
     folder = tmp_path_factory.mktemp("theirs") / "files"
-    return folder, publish(folder)
+    return folder, write_published_files(folder)
 
 
 @pytest.fixture(scope="session")

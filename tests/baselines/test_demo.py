@@ -1,4 +1,4 @@
-"""Test the demo with a tiny model on few histories; the slow test uses the bundled release."""
+"""Test the demo with a tiny model on few histories, and with the bundled release."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ EARNED = {"stay": (0.0, 0.0), "search": (-20.0, 40.0), "oracle": (40.0, 40.0)}
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
-    """Return a release of random play with histories of the sources search and ppo."""
+    """Return a release of random play with histories of the sources `search` and `ppo`."""
     root = tmp_path_factory.mktemp("demo") / "release"
     random_release(root, layouts=("demo_wide",), streams=2, length=100, sources=("search", "ppo"))
     return root
@@ -79,6 +79,7 @@ def test_conclusion_says_whether_memory_raises_the_return(last, last_cleared, ve
     assert said.startswith(f"Its return {verdict} what it remembers: {last + 1.5:+.1f}")
 
 
+@pytest.mark.slow
 def test_demo_prints_every_step_and_writes_all_files(release, tmp_path, monkeypatch):
     """The model is really trained, but results of its evaluation are invented."""
     monkeypatch.setattr(results, "evaluate", fake_evaluate(20.0, 0.0))

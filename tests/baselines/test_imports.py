@@ -28,7 +28,7 @@ except ValueError as error:
 
 
 def test_main_functions_are_imported_from_the_package_without_jax():
-    """The program stops at an unknown protocol, since compiling an evaluation takes seconds."""
+    """The program passes an unknown protocol to `evaluate`, because a real evaluation takes seconds to compile."""
     assert run_python("-c", USE).startswith("unknown protocol 'publishd'; valid: published, ")
 
 

@@ -32,21 +32,22 @@ def small_options(root: Path) -> ProofOptions:
     return ProofOptions(str(root), steps=2, batch_size=2, context=20, tasks=tasks)
 
 
-def returns(first: float, late: float, cleared: float, teammate: float) -> dict[str, Any]:
+def block_returns(first: float, late: float, cleared: float, teammate: float) -> dict[str, Any]:
     blocks = {"preference": {"1": first, "6-20": late}, "preference cleared": {"1": first, "6-20": cleared}}
     return blocks | {"teammate": {"all": teammate}}
 
 
-def test_proof_table_has_mean_and_range_over_finished_trainings(release, tmp_path):
+def test_proof_table_has_mean_and_range_over_finished_training_runs(release, tmp_path):
     options = small_options(release)
     jobs = [ProofJob("all", "ad-expert", seed, options, tmp_path) for seed in (0, 1, 2)]
     for job, late in zip(jobs[:2], (10.0, 20.0), strict=True):  # the third job stays unfinished
         job.folder.mkdir()
-        content = {"settings": job.settings, "minutes": 20.0, "returns": returns(-2.0, late, -1.0, late / 2)}
+        content = {"settings": job.settings, "minutes": 20.0, "returns": block_returns(-2.0, late, -1.0, late / 2)}
         job.result_file.write_text(json.dumps(content))
     assert [job.is_finished() for job in jobs] == [True, True, False]
     earned = {
-        name: returns(0.0, 40.0, 0.0, value) for name, value in (("stay", 0), ("search", 30), ("rl2-reference", 20))
+        name: block_returns(0.0, 40.0, 0.0, value)
+        for name, value in (("stay", 0), ("search", 30), ("rl2-reference", 20))
     }
     path = write_proof(jobs, earned, tmp_path / "proof.json")
     content = json.loads(path.read_text())

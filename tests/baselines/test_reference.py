@@ -66,10 +66,10 @@ def test_reference_command_rejects_unknown_names(tmp_path):
 def test_reference_model_is_bundled_with_all_tracks(tmp_path, monkeypatch):
     copied, cards = [], []
 
-    def make(name: str, track: str, *given: Any) -> ReferenceOutcome:
+    def fake_make_reference(name: str, track: str, *given: Any) -> ReferenceOutcome:
         return ReferenceOutcome(name, track, tmp_path / track, {})
 
-    monkeypatch.setattr(reference, "make_reference", make)
+    monkeypatch.setattr(reference, "make_reference", fake_make_reference)
     monkeypatch.setattr(bundled, "bundle_run", lambda run, name, track, **way: copied.append((name, track)))
     monkeypatch.setattr(reference, "write_bundled_card", lambda name, found, **way: cards.append(found))
     command = ["research", "reference", "--name", "rl2-reference", "--out", tmp_path, "--bundle-as", "rl2-reference"]
@@ -117,7 +117,7 @@ def tiny_recipes(monkeypatch, tmp_path) -> Path:
     monkeypatch.setattr(reference, "TRACKS", {"layout": {"train": ("asymm_both",)}})
     monkeypatch.setattr(trainer, "can_draw", lambda: False)
     diverse = read_tasks(manifest_path("layout", "train", "diverse"))
-    # Only one family and layout, since others need other compiled programs.
+    # Tasks of one family on one layout share compiled programs.
     few = [task for task in diverse if (task.layout.name, task.teammate_family) == ("asymm_both", "H1")]
     monkeypatch.setattr(reference, "read_tasks", lambda path: few[:1])
     histories = load_icrl4aht(layout="asymm_both", teammate_family="H1", source="noise")

@@ -48,7 +48,7 @@ MEASURED = {
 """Keys that each benchmark case must print, by part of the benchmark."""
 
 
-def lines_of(output: str) -> dict[str, dict[str, Any]]:
+def lines_by_case(output: str) -> dict[str, dict[str, Any]]:
     return {line["case"]: line for line in map(json.loads, re.findall("^{.*", output, re.MULTILINE))}
 
 
@@ -59,7 +59,7 @@ def test_gpu_benchmark_prints_expected_keys_of_each_case(monkeypatch):
     assert {case.split("/")[0] for case in cases} == set(PARTS)
     options = [word for case in cases for word in ("--case", case)]
     monkeypatch.chdir(ROOT)
-    found = lines_of(run_cli(*options, "--seconds", 0.01, program=bench_gpu.main))
+    found = lines_by_case(run_cli(*options, "--seconds", 0.01, program=bench_gpu.main))
     assert list(found) == cases
     for case, line in found.items():
         assert MEASURED[case.split("/")[0]] <= line.keys(), case
@@ -69,7 +69,7 @@ def test_gpu_benchmark_prints_expected_keys_of_each_case(monkeypatch):
 
 
 def test_cases_after_the_time_limit_are_reported_as_skipped():
-    found = lines_of(run_cli("--minutes 0", program=bench_gpu.main))
+    found = lines_by_case(run_cli("--minutes 0", program=bench_gpu.main))
     assert found.keys() == CASES.keys()
     assert all(line["skipped"] for line in found.values())
 
@@ -77,7 +77,7 @@ def test_cases_after_the_time_limit_are_reported_as_skipped():
 def test_error_of_a_case_is_reported_and_ends_the_process(monkeypatch):
     monkeypatch.setitem(CASES, "product", lambda sizes: 1 / 0)
     printed = run_cli("--here --part product --part loader", code=1, program=bench_gpu.main)
-    assert lines_of(printed) == {
+    assert lines_by_case(printed) == {
         "product": {"benchmark": "gpu", "case": "product", "error": "ZeroDivisionError: division by zero"}
     }
 
@@ -85,13 +85,13 @@ def test_error_of_a_case_is_reported_and_ends_the_process(monkeypatch):
 def test_batch_that_does_not_fit_in_memory_is_split(monkeypatch):
     tried = []
 
-    def steps(sizes, size, encoder, dtype, parts):
+    def fake_training_steps(sizes, size, encoder, dtype, parts):
         tried.append(parts)
         if parts < 4:
             raise (MemoryError("96 GiB"), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: .."))[parts - 1]
         return {"accumulate": parts}
 
-    monkeypatch.setattr(bench_gpu, "_training_steps", steps)
+    monkeypatch.setattr(bench_gpu, "_training_steps", fake_training_steps)
     measure = partial(measure_training, size="small", encoder="paper", dtype="float32")
     assert measure(FULL_SIZES) == {"accumulate": 4}
     assert tried == [1, 2, 4]

@@ -22,18 +22,18 @@ for case in sys.argv[1:]:
 """
 
 
-def run(*cases: str, seconds: float = 30, case_seconds: float = 20) -> tuple[int, dict]:
+def run_cases(*cases: str, seconds: float = 30, case_seconds: float = 20) -> tuple[int, dict]:
     """Run benchmark cases; return the number of failures and the printed values of each case."""
     found = {}
 
-    def note(case, values):
+    def store_values(case, values):
         assert case not in found
         found[case] = values
 
     failures = run_isolated(
         cases,
         lambda names: [sys.executable, "-c", CHILD, *names],
-        note,
+        store_values,
         until=time.monotonic() + seconds,
         case_seconds=case_seconds,
     )
@@ -42,7 +42,7 @@ def run(*cases: str, seconds: float = 30, case_seconds: float = 20) -> tuple[int
 
 
 def test_benchmark_cases_share_a_process_until_a_case_fails():
-    failures, found = run("one", "two", "fail", "three", "crash", "four")
+    failures, found = run_cases("one", "two", "fail", "three", "crash", "four")
     assert failures == 2
     assert found["one"] == found["two"]
     assert found["fail"] == {"benchmark": "x", "error": "too large"}
@@ -51,7 +51,7 @@ def test_benchmark_cases_share_a_process_until_a_case_fails():
 
 
 def test_hanging_benchmark_case_is_stopped_and_the_next_case_runs():
-    failures, found = run("one", "hang", "two", case_seconds=1)
+    failures, found = run_cases("one", "hang", "two", case_seconds=1)
     assert failures == 1
     assert found["hang"] == {"error": "stopped after 1 s"}
     assert found["one"]["process"] != found["two"]["process"]

@@ -20,7 +20,7 @@ from tests.helpers.commands import run_cli
 from tests.helpers.tiny import TINY
 
 
-def run(module: Any, options: str) -> list[dict[str, Any]]:
+def run_benchmark(module: Any, options: str) -> list[dict[str, Any]]:
     """Run a benchmark's command and return the JSON lines that it prints."""
     printed = run_cli(options, program=module.main)
     return [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
@@ -38,7 +38,7 @@ def test_collection_benchmark_measures_speed_and_size(tmp_path, monkeypatch):
     root = to_release(load_icrl4aht(layout="coord_simple"), tmp_path / "part", "lite")
     monkeypatch.setattr(bench_collect, "load_icrl4aht", partial(load_icrl4aht, root))
     (tmp_path / "tiny.toml").write_text(TINY)
-    speed, size = run(bench_collect, f"speed bytes --profile {tmp_path}/tiny.toml --updates 3 --streams 1")
+    speed, size = run_benchmark(bench_collect, f"speed bytes --profile {tmp_path}/tiny.toml --updates 3 --streams 1")
     assert speed["recorded_transitions_per_second"] > 0
     assert 0 < speed["recording_and_writing_share"] < 1
     assert size["paper_bytes_per_transition"] > size["full_bytes_per_transition"] > size["lite_bytes_per_transition"]
@@ -47,7 +47,9 @@ def test_collection_benchmark_measures_speed_and_size(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_environment_benchmark_compares_with_jaxmarl(monkeypatch):
     monkeypatch.setattr(bench_env, "STEPS", 8)
-    lines = run(bench_env, "--layout cramped_up --environments 2 --rounds 1 --written state --written float32")
+    lines = run_benchmark(
+        bench_env, "--layout cramped_up --environments 2 --rounds 1 --written state --written float32"
+    )
     facts = [(line["part"], line["written"]) for line in lines]
     assert facts == [("layouts", "uint8"), ("steps", "state"), ("steps", "float32")]
     for line in lines:
@@ -90,7 +92,7 @@ def test_jaxmarl_script_is_run_with_both_environments(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_reading_benchmark_compares_with_other_readers(tmp_path):
     options = "--histories 2 --batch 3 --length 100 --rounds 1 --threads 1"
-    read = run(bench_loader, f"--folder {tmp_path} {options}")
+    read = run_benchmark(bench_loader, f"--folder {tmp_path} {options}")
     assert len(read) == 2 * (4 + 3 + 3)
     for line in read:
         check_ratio(line, line["peer"])
@@ -116,7 +118,7 @@ def test_learning_benchmark_compares_ego_profiles(tmp_path):
         path = tmp_path / f"{encoder}.toml"
         path.write_text(TINY.replace("widths = {", f'widths = {{ encoder = "{encoder}",'))
         options += f" --profile {path}"
-    first, second = run(bench_learn, options)
+    first, second = run_benchmark(bench_learn, options)
     assert [(line["profile"], line["encoder"]) for line in (first, second)] == [("paper", "paper"), ("mlp", "mlp")]
     assert first["ratio"] == 1
     check_ratio(second, "paper")
@@ -128,7 +130,9 @@ def test_learning_benchmark_measures_sequence_models(monkeypatch):
     tasks = [task for task in published_tasks("teammate") if task.layout.name == "demo_wide"][:1]
     monkeypatch.setattr(bench_learn, "published_tasks", lambda track: tasks)
     parts = "--part ad --part act --part tasks --encoder mlp --batch 2 --length 6 --steps 1"
-    training, acting, all_tasks = run(bench_learn, f"{parts} --acting-steps 2 --episodes 1 --tasks 1 --rounds 1")
+    training, acting, all_tasks = run_benchmark(
+        bench_learn, f"{parts} --acting-steps 2 --episodes 1 --tasks 1 --rounds 1"
+    )
     check_ratio(training, "published")
     check_ratio(acting, "exact")
     assert (all_tasks["tasks"], all_tasks["episodes"]) == (2, 1)

@@ -1,4 +1,4 @@
-"""Helpers of sampling tests: samplers of each kind, a comparison of batches, and a hash of batches."""
+"""Helpers for sampling tests: samplers of each kind, a comparison of batches, and a hash of batches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icrl4aht_data.reading.sources import CacheMode
 CACHES: tuple[CacheMode, ...] = ("ram", "mmap", "stream")
 
 
-def samplers(dataset, **options):
+def example_samplers(dataset, **options):
     """Return AD and DPT samplers with different lengths and orders."""
     return [
         dataset.ad(batch_size=6, length=50, teammate_actions=True, **options),
@@ -24,15 +24,15 @@ def samplers(dataset, **options):
     ]
 
 
-def assert_equal(one, two) -> None:
+def assert_equal_batches(one, two) -> None:
     """Assert that two batches have equal arrays and that the same fields are None."""
     assert one._fields == two._fields
     for name, array in one._asdict().items():
         np.testing.assert_array_equal(array, getattr(two, name), err_msg=name, strict=True)
 
 
-def digest(root: Path) -> str:
-    """Return the SHA-256 of a few AD and DPT batches of a release's layout demo_wide."""
+def batches_digest(root: Path) -> str:
+    """Return the SHA-256 of a few AD and DPT batches of the histories of a release on the layout demo_wide."""
     dataset = load_icrl4aht(root, layout="demo_wide")
     samplers = [
         dataset.ad(batch_size=5, length=40, seed=7, teammate_actions=True),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 
-def embedded(html: bytes) -> tuple[dict[str, Any], list[bytes]]:
+def embedded_data(html: bytes) -> tuple[dict[str, Any], list[bytes]]:
     """Return the index of a page and the decompressed data of each of the page's histories."""
     (text,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', html.decode(), re.DOTALL)
     data = json.loads(text)
@@ -19,8 +19,8 @@ def embedded(html: bytes) -> tuple[dict[str, Any], list[bytes]]:
     return json.loads(index), histories
 
 
-def episodes(index: dict[str, Any], facts: dict[str, Any], content: bytes) -> dict[int, dict[str, np.ndarray]]:
-    """Return the columns of each shown episode, by episode number and name; "state" is uint8 (frames, S)."""
+def embedded_episodes(index: dict[str, Any], facts: dict[str, Any], content: bytes) -> dict[int, dict[str, np.ndarray]]:
+    """Return a dict from episode number to column name to values; the column "state" is uint8 (frames, S)."""
     size, names = index["layouts"][facts["layout"]]["record_size"], facts["columns"]
     columns = np.frombuffer(content, np.uint8).reshape(size + len(names), sum(facts["frames"]))
     named = {"state": columns[:size].T, **dict(zip(names, columns[size:], strict=True))}

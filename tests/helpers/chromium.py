@@ -27,7 +27,7 @@ def chromium() -> Iterator[Callable[..., Any]]:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         problems: list[str] = []
 
-        def note_requests(request: Any) -> None:
+        def record_requests(request: Any) -> None:
             if request.frame.url.startswith("file:") and request.url.startswith("http"):
                 problems.append(request.url)
 
@@ -37,7 +37,7 @@ def chromium() -> Iterator[Callable[..., Any]]:
             page.set_default_timeout(60_000)
             page.on("pageerror", lambda error: problems.append(str(error)))
             page.on("console", lambda message: problems.append(message.text))
-            page.on("request", note_requests)
+            page.on("request", record_requests)
             page.goto(address)
             return page
 
@@ -57,7 +57,7 @@ def wait_until(page: Any, condition: str, seconds: float = 30) -> None:
         page.wait_for_timeout(20)
 
 
-def check_phone(page: Any, dark: bool) -> None:
+def check_fits_phone(page: Any, dark: bool) -> None:
     """Assert that a page fits the width of a phone, and that its background is dark if and only if `dark` is set."""
     assert page.evaluate("document.documentElement.scrollWidth") == PHONE
     shade = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")

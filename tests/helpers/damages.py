@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def file_contents(folder: Path) -> dict[str, bytes]:
     """Return the content of each file below a folder, by relative path."""
     paths = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
@@ -30,8 +30,8 @@ def _flip_bit_keeping_times(path: Path) -> None:
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
-def _replace(path: Path) -> None:
-    """Replace a file by a valid NumPy file with another array."""
+def _replace_by_array(path: Path) -> None:
+    """Replace a file by a valid NumPy file with an unrelated array."""
     np.save(path.with_name("other.npy"), np.arange(7))
     path.with_name("other.npy").replace(path)
 
@@ -58,7 +58,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
     "cut off": lambda path: os.truncate(path, path.stat().st_size // 2),
     "longer": lambda path: os.truncate(path, path.stat().st_size + 1),
     "missing": lambda path: path.unlink(),
-    "foreign": _replace,
+    "foreign": _replace_by_array,
     "text": lambda path: path.write_text("hello\n"),
     "a folder": _make_folder,
     "a dangling link": _make_link,
@@ -67,7 +67,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 """Name of a damage -> function that damages an existing file in this way."""
 
 
-def restore(path: Path, data: bytes) -> None:
+def restore_file(path: Path, data: bytes) -> None:
     """Write a file with the given content, after removing the file, folder or link at its path."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)

@@ -1,4 +1,4 @@
-"""Invented evaluation results, as runs and as folders, and invented best responses."""
+"""Make invented evaluation results, in memory or in folders, and invented best responses."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def evaluated_run(
     details=None,
     steps=100,
 ) -> EvaluationRun:
-    """Return a run whose results have return `value` in the first half of the episodes and `value` + 2 in the second.
+    """Return an evaluation run with return `value` in the first half of the episodes and `value` + 2 in the second.
 
     Args:
         note: text that distinguishes the runs of one agent.
@@ -56,11 +56,11 @@ def evaluated_run(
 
 
 SPAN = 20.0
-"""Margin over `stay` of the best responses that `write_measured` invents, for teammates with headroom."""
+"""Margin over `stay` of the best responses that `write_invented_responses` invents, for teammates with headroom."""
 
 
-def write_measured(path: Path) -> Path:
-    """Write best responses to all test tasks; on each layout, the five H4 teammates share one behaviour."""
+def write_invented_responses(path: Path) -> Path:
+    """Write invented best responses to the teammates of all test tasks; a layout's five H4 teammates share one."""
     stays, headroom, behaviours = stay_returns("seeded"), read_headroom("seeded"), []
     for (layout, family), egos in headroom.items():
         tasks = [task for task in TEST_TASKS if (task.layout.name, task.teammate_family) == (layout, family)]
@@ -81,11 +81,12 @@ def write_results(
     offset=0.0,
     **details,
 ) -> Path:
-    """Write results of all test tasks of a track as `evaluate` does, with the same curve of 100 returns for each seed.
+    """Write results of all test tasks of a track as `evaluate` does, with equal returns for all three seeds.
 
     Args:
+        curve: returns of the 100 episodes of a task.
         details: further details of the agent, such as `forget`.
-        offset: number that is added to all returns, times the index of the teammate in its family.
+        offset: number added to the returns, multiplied by the teammate's index in its family.
     """
     settings = {"agent": agent, "seeds": [0, 1, 2], "protocol": get_protocol("seeded").settings}
     details |= {} if trained_on is None else {"trained_on": [*trained_on]}

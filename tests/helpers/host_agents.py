@@ -1,4 +1,4 @@
-"""A host agent that records what it receives."""
+"""An agent that runs on the host, in NumPy, and records its inputs."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from icrl4aht_data.overcooked.actions import STAY
 
 
 class HostRecorder:
-    """A host agent that stays, or plays chosen actions, and records its inputs and actions after each reset.
+    """An agent on the host that takes chosen actions, by default `stay`, and records its inputs and actions.
 
     Args:
-        choose: function from the number of tasks to the actions.
+        choose: function that takes the number of tasks and returns an action for each task.
     """
 
     def __init__(self, choose: Callable[[int], Any] = lambda batch: np.full(batch, STAY)) -> None:

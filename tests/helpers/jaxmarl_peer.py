@@ -59,7 +59,7 @@ def to_jaxmarl_state(layout: Layout, env: OvercookedV2, records: np.ndarray) -> 
 
 
 def from_jaxmarl_state(layout: Layout, state: JaxmarlState) -> np.ndarray:
-    """Convert JaxMARL's batched state to records uint8 (B, S), without the package's packing code."""
+    """Convert JaxMARL's batched state to records uint8 (B, S), without using this package's function `pack`."""
     position = np.asarray(state.agents.pos.y) * layout.width + np.asarray(state.agents.pos.x)
     grid = np.asarray(state.grid).reshape(len(position), layout.cells, 3)
     columns = [
@@ -77,7 +77,7 @@ def from_jaxmarl_state(layout: Layout, state: JaxmarlState) -> np.ndarray:
 
 
 def jaxmarl_step(env: OvercookedV2):
-    """Return a jitted batched step of JaxMARL's environment: (keys, states, actions (B, 2) in JaxMARL's ids)."""
+    """Return JaxMARL's step function, jitted and batched, of keys, states and actions (B, 2) in JaxMARL's ids."""
 
     def single_step(key, state, actions):
         obs, state, reward, _, info = env.step_env(key, state, {"agent_0": actions[0], "agent_1": actions[1]})

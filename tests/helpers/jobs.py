@@ -13,7 +13,7 @@ from icrl4aht_generation.learners.resume import BusyError
 
 @dataclass(frozen=True)
 class FileJob:
-    """A job that writes its process id into a file, and fails in its first `failures` attempts."""
+    """A job that writes its process id to a file, after failing in its first `failures` attempts."""
 
     out: Path
     name: str

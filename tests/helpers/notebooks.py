@@ -19,7 +19,7 @@ from tests.helpers.paths import ROOT
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 
-def execute(path: Path, folder: Path, changes: Mapping[str, str] | None = None) -> Any:
+def execute_notebook(path: Path, folder: Path, changes: Mapping[str, str] | None = None) -> Any:
     """Execute a notebook in a new kernel and return the notebook with its outputs.
 
     Args:
@@ -46,18 +46,18 @@ def execute(path: Path, folder: Path, changes: Mapping[str, str] | None = None) 
         return client.execute()
 
 
-def outputs(notebook: Any) -> Iterator[Any]:
+def cell_outputs(notebook: Any) -> Iterator[Any]:
     """Yield the outputs of all cells of a notebook."""
     for cell in notebook.cells:
         yield from cell.get("outputs", ())
 
 
-def store(path: Path) -> None:
-    """Execute a notebook and store its outputs, without times and with neutral names of folders."""
+def store_outputs(path: Path) -> None:
+    """Execute a notebook and store its outputs; remove times, and replace this machine's paths by neutral paths."""
     import nbformat
 
     with tempfile.TemporaryDirectory() as folder:
-        notebook = execute(path, Path(folder))
+        notebook = execute_notebook(path, Path(folder))
     text = re.sub(r"(?<=data:image/png;base64,)[\w+/=]+", _shrink_image, nbformat.writes(_remove_times(notebook)))
     for found, shown in ((str(ROOT), "/home/you/icrl4aht-data"), (folder, "/home/you/work")):
         text = text.replace(found, shown)
@@ -78,7 +78,7 @@ def _remove_times(notebook: Any) -> Any:
     for number, cell in enumerate(notebook.cells):
         cell["id"] = f"cell-{number:02}"
         cell["metadata"] = {}
-    for output in outputs(notebook):
+    for output in cell_outputs(notebook):
         output.get("metadata", {}).clear()
         if output["output_type"] == "stream":
             output["text"] = re.sub(r"\x1b\[[0-9;]*m", "", output["text"])  # remove color codes
@@ -92,4 +92,4 @@ def _remove_times(notebook: Any) -> Any:
 if __name__ == "__main__":
     for each in NOTEBOOKS:
         if each.stem in sys.argv[1:] or len(sys.argv) == 1:
-            store(each)
+            store_outputs(each)

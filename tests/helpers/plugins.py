@@ -17,7 +17,7 @@ from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS
 def write_package(
     folder: Path, name: str, modules: Mapping[str, str], entry_points: Mapping[str, Mapping[str, str]]
 ) -> Path:
-    """Write a package of version 0.1 and its metadata, as an installer would; return the folder.
+    """Write a package of version 0.1 with the metadata that an installer would write; return the folder.
 
     Args:
         folder: folder to write into, to be put on Python's path.
@@ -40,8 +40,8 @@ def write_package(
 
 
 @contextmanager
-def installed(*folders: Path) -> Iterator[None]:
-    """Put folders of `write_package` on this process's Python path within a context, and find all plugins again."""
+def installed_plugins(*folders: Path) -> Iterator[None]:
+    """Put packages written by `write_package` on the Python path within a context, so that their plugins are found."""
     with ExitStack() as stack:
         stack.enter_context(mock.patch.object(sys, "path", [*map(str, folders), *sys.path]))
         for plugins in (LAYOUT_PLUGINS, TEAMMATE_PLUGINS, METHOD_PLUGINS):

@@ -30,8 +30,13 @@ def population(algorithm: Algorithm, config: PPOConfig = CONFIG, **options: Any)
     return Population(Environment(LAYOUT, max_steps=EPISODE), algorithm, config, **options)
 
 
-def paper_adapt(old: Multipliers, returns: np.ndarray, seen: np.ndarray, tolerance: float, rate: float) -> Multipliers:
-    """Return the LBRDiv paper's multipliers; entry [i, j] is for confederate i with best response j."""
+def paper_multipliers(
+    old: Multipliers, returns: np.ndarray, seen: np.ndarray, tolerance: float, rate: float
+) -> Multipliers:
+    """Return LBRDiv's multipliers after one update by the paper's rule.
+
+    Entry [i, j] belongs to confederate i with best response j.
+    """
     k = len(old.vertical)
     vertical, horizontal, latest = (np.array(x, np.float64) for x in old[:3])
     known = np.array(old.known)

@@ -21,7 +21,7 @@ SHARD = "data/teammate/demo_wide/train-00000-of-00001.h5"
 _IDS = {name: number for number, name in enumerate(PUBLISHED_ACTIONS)}
 
 
-def publish(folder: Path) -> list[dict[str, np.ndarray]]:
+def write_published_files(folder: Path) -> list[dict[str, np.ndarray]]:
     """Write `histories.h5` and its index, without states and tasks, and with an unfinished last episode.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Write releases of random play, simulated by the NumPy rules: valid states, rewards and episode ends, no learning."""
+"""Write releases of random play, simulated by the NumPy rules: states and rewards are valid, but no agent learns."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def random_history(layout: Layout, episodes: int, length: int, rng: np.random.Ge
 
 
 def make_tasks(layouts: list[str], teammates: int = 1, recipes: Sequence[Dish] | None = None) -> list[Task]:
-    """Return tasks with different heuristic teammates, in split train if it contains the layout, else in test."""
+    """Return tasks with different heuristic teammates; on training layouts the split is train, on others test."""
     return [
         make_task(
             track_of(layout),
@@ -138,7 +138,7 @@ def one_history_release(
     return write_release(root, kind, [new], data_version="0.0.1", card="", kept_steps=20)
 
 
-def long_index(root: Path, lines: int = 3000) -> list[Entry]:
+def write_long_index(root: Path, lines: int = 3000) -> list[Entry]:
     """Write the metadata of a release of `lines` histories, without shards; return the index entries."""
     source = load_icrl4aht(MINI).entries
     rng = np.random.default_rng(0)

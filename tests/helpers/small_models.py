@@ -20,14 +20,14 @@ FLAT = World(lambda dtype: FlatEncoder(8, dtype), (3,), plain_view, 4)
 
 
 def random_parameters(method: Method) -> Any:
-    """Return random parameters without calling the method's initialization, which takes long to compile."""
+    """Return random parameters without calling the method's initialization, which is slow to compile."""
     rng = np.random.default_rng(1)
 
-    def leaf(path, shape):
+    def random_leaf(path, shape):
         centre = 1.0 if path[-1].key == "scale" else 0.0
         return jnp.asarray(rng.normal(centre, (sum(shape.shape[:-1]) or 100) ** -0.5, shape.shape), jnp.float32)
 
-    return jax.tree_util.tree_map_with_path(leaf, jax.eval_shape(method.init, jax.random.key(0)))
+    return jax.tree_util.tree_map_with_path(random_leaf, jax.eval_shape(method.init, jax.random.key(0)))
 
 
 def ad_batch(rows=2, length=7, seed=0) -> ADBatch:

@@ -1,4 +1,4 @@
-"""Put wrong values into releases whose checksums are valid, and list the problems that `verify_release` finds."""
+"""Put wrong values into releases, update their checksums, and list the problems that `verify_release` finds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Change = Callable[[Any], Any]
 
 
 def problems(root: Path, level: Level = "full") -> list[str]:
-    """Return the problems that `verify_release` finds in a release, as texts `<file>: <problem>`."""
+    """Return the problems that `verify_release` finds in a release, as `<file>: <problem>`."""
     return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, level=level).findings]
 
 
@@ -44,7 +44,7 @@ def spoil(root: Path, name: str, change: Change) -> None:
     write_manifest(root)
 
 
-def spoiled(source: Path, target: Path, name: str, change: Change) -> Path:
+def spoiled_copy(source: Path, target: Path, name: str, change: Change) -> Path:
     """Copy a release and change one file of the copy by `spoil`."""
     shutil.copytree(source, target)
     spoil(target, name, change)

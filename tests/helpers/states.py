@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.state import (
 
 
 def random_records(layout: Layout, size: int, rng: np.random.Generator) -> np.ndarray:
-    """Return random valid state records uint8 (size, S), most with items in hands, in pots and on counters."""
+    """Return random valid state records uint8 (size, S); most have items in hands, in pots and on counters."""
     items = possible_items(layout).nonzero()[0]
     counts = ingredient_count(items)
     in_pot = items[items & PLATE == 0]
@@ -27,7 +27,7 @@ def random_records(layout: Layout, size: int, rng: np.random.Generator) -> np.nd
     dishes = items[items & (PLATE | COOKED) == PLATE | COOKED]
     matching = layout.recipe_items | PLATE | COOKED
 
-    def draw(*shape):
+    def random_items(*shape):
         kind = rng.random(shape)
         some = np.where(kind < 0.75, rng.choice(useful, shape), rng.choice(dishes, shape))
         return np.where(kind > 0.85, rng.choice(matching, shape), some)
@@ -46,13 +46,13 @@ def random_records(layout: Layout, size: int, rng: np.random.Generator) -> np.nd
                 for field in (
                     positions,
                     rng.integers(0, 4, (size, 2)),
-                    draw(size, 2),
+                    random_items(size, 2),
                     rng.choice(layout.recipe_items, size),
                     rng.integers(0, 2, size),
                     pot_items,
                     np.where(raw_full, rng.integers(1, POT_STEPS + 1, (size, pots)), 0),
                     rng.integers(0, BUTTON_STEPS + 1, (size, buttons)),
-                    np.where(fill, draw(size, counters), 0),
+                    np.where(fill, random_items(size, counters), 0),
                 )
             )
         )

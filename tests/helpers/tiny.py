@@ -51,12 +51,12 @@ widths = { pointwise = [4], spatial = [4], dense = 8, gru = 8, head = 8 }
 
 
 def artefact(out: Path, number: int = 0) -> Path:
-    """Return the folder of a finished task; `number` is the position of the task's id in sorted order."""
+    """Return an artefact, the folder of a finished task; `number` counts the tasks in the order of their ids."""
     return sorted(path for path in (out / "artefacts").iterdir() if path.is_dir())[number]
 
 
-def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
-    """Start Python in the repository, with its folder on Python's path and with variables added to the environment."""
+def start_python(*arguments: str, **environment: str) -> subprocess.Popen[str]:
+    """Start Python in the repository's folder, with this folder on Python's path and given environment variables."""
     return subprocess.Popen(
         [sys.executable, *arguments],
         stdout=subprocess.PIPE,

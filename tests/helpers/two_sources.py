@@ -37,11 +37,10 @@ PARTS = (("train", "ppo"), ("train", "noise"), ("validation", "noise"))
 def two_source_release(
     root: Path, ppo_episodes: int = EPISODES, oracle: tuple[str, ...] = SOURCES
 ) -> dict[int, dict[str, np.ndarray]]:
-    """Write a release with two tasks for each of `PARTS` on two layouts; return the written arrays by history id.
+    """Write a release with two tasks for each pair in `PARTS` on two layouts; return the written arrays by history id.
 
-    A task of source ppo has two learners with two histories of `ppo_episodes` episodes each; a task of source noise has
-    three histories. All actions are random: no learner improves. Histories of the sources `oracle` are stored with
-    oracle actions.
+    A PPO task has two learners with two histories of `ppo_episodes` episodes each; a noise task has three histories.
+    All actions are random, so no learner improves. Histories of the sources in `oracle` have oracle actions.
     """
     rng = np.random.default_rng(0)
     written: dict[int, dict[str, np.ndarray]] = {}
@@ -66,7 +65,7 @@ def two_source_release(
 
 
 def _tasks() -> Iterator[tuple[Task, str]]:
-    """Yield each task and its source; teammates are of all heuristic families, and differ between the splits."""
+    """Yield each task and its source; teammates are from all heuristic families and differ between the splits."""
     for number, (layout, (split, source), _) in enumerate(
         itertools.product(("demo_wide", "coord_simple"), PARTS, range(2))
     ):
@@ -81,7 +80,7 @@ def _tasks() -> Iterator[tuple[Task, str]]:
 
 
 def _oracle_actions(actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return labels that agree with the taken actions with a chance rising from 0 to 1 over the episodes."""
+    """Return labels; the probability that a label is the taken action rises from 0 to 1 over the episodes."""
     chance = np.repeat(np.linspace(1.0, 0.0, len(actions) // LENGTH), LENGTH)
     return np.where(rng.random(len(actions)) < chance, rng.integers(0, 6, len(actions)), actions)
 

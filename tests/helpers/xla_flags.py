@@ -8,7 +8,7 @@ import sys
 
 
 def add_xla_flag(flag: str) -> str:
-    """Return the value of the variable `XLA_FLAGS` with a flag added, if it is missing."""
+    """Return the value of the environment variable `XLA_FLAGS`, extended by a flag unless the flag is already set."""
     flags = os.environ.get("XLA_FLAGS", "").split()
     return " ".join(flags if flag in flags else [*flags, flag])
 

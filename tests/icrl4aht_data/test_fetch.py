@@ -37,11 +37,11 @@ from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
-from tests.helpers.batches import assert_equal
+from tests.helpers.batches import assert_equal_batches
 from tests.helpers.commands import run_cli
-from tests.helpers.damages import contents, flip_bit
+from tests.helpers.damages import file_contents, flip_bit
 from tests.helpers.random_releases import SHARD
-from tests.servers.faults import Cut, Fault, Flip, Long, Redirect, Short, Slow, Status
+from tests.servers.faults import CutBody, ErrorStatus, Fault, FlippedByte, LongBody, Redirect, ShortBody, SlowAnswer
 from tests.servers.http import Answer, Server, http_server
 from tests.servers.hub import Hub, hub_server
 from tests.servers.process import hub_environment, hub_settings
@@ -93,7 +93,7 @@ def shard_names(folder: Path) -> set[str]:
 # Tests of reading
 
 
-def test_remote_release_with_an_old_source_card_can_be_opened(lite, tmp_path):
+def test_remote_release_with_the_source_card_of_older_versions_can_be_opened(lite, tmp_path):
     shutil.copytree(lite[0], tmp_path / "served")
     (tmp_path / "served" / "meta" / "source_card.md").write_text("# card\n")
     write_manifest(tmp_path / "served")
@@ -112,11 +112,11 @@ def test_a_remote_release_equals_its_local_copy(kind, lite, monkeypatch):
         one = remote.filter(layout="demo_wide")
         assert np.array_equal(one[0].expert_actions, local.filter(layout="demo_wide")[0].expert_actions)
         assert len(shard_names(remote.root)) == 1, "a shard is fetched when one of its histories is read"
-        assert_equal(load_batch(pickle.loads(pickle.dumps(one)).origin.folder), load_batch(lite[0]))
+        assert_equal_batches(load_batch(pickle.loads(pickle.dumps(one)).origin.folder), load_batch(lite[0]))
         for cache in ("auto", "ram", "mmap", "stream"):
-            assert_equal(load_batch(url, "coord_simple", cache=cache), load_batch(lite[0], "coord_simple"))
+            assert_equal_batches(load_batch(url, "coord_simple", cache=cache), load_batch(lite[0], "coord_simple"))
         monkeypatch.setenv("ICRL4AHT_OFFLINE", "1")
-        assert_equal(load_batch(url), load_batch(lite[0]))
+        assert_equal_batches(load_batch(url), load_batch(lite[0]))
     assert not [path for path in remote.root.parent.rglob("*") if "partial" in path.name or path.suffix == ".lock"]
 
 
@@ -131,7 +131,7 @@ def test_offline_mode_reads_only_downloaded_files(kind, lite, variable, monkeypa
         monkeypatch.delenv(variable)
         fetch_planned(plan_download(url, layout="demo_wide"))
         monkeypatch.setenv(variable, "1")
-        assert_equal(load_batch(url), load_batch(lite[0]))
+        assert_equal_batches(load_batch(url), load_batch(lite[0]))
         message = rf"offline, but these files are missing.*: .*data/teammate/coord_simple/train-0.*; unset {variable}"
         with pytest.raises(OfflineError, match=message):
             load_batch(url, "coord_simple", cache="ram")
@@ -180,7 +180,7 @@ def test_partial_download_can_be_completed_later(kind, lite, tmp_path):
         assert report.ok, report.findings
         assert verify_release(url, level="quick").ok
     assert verify_release(target, level="deep").notes == []
-    assert contents(target) == contents(lite[0])
+    assert file_contents(target) == file_contents(lite[0])
     (target / SHARD).unlink()
     assert verify_release(target).files_at_fault == {SHARD}
     assert {path.name for path in tmp_path.iterdir()} <= {"mine", "data", "hub"}, "no locks"
@@ -194,7 +194,7 @@ def test_download_command_fetches_missing_and_changed_files(lite, tmp_path, monk
         monkeypatch.setenv("ICRL4AHT_REMOTE", server.url)
         printed = run_cli("download", "--to", target)
         assert "bytes downloaded" in printed
-        files = len(contents(target)) - 1
+        files = len(file_contents(target)) - 1
         for name in (SHARD, "README.md"):
             flip_bit(target / name)
         again = run_cli("download", "--to", target)
@@ -202,7 +202,7 @@ def test_download_command_fetches_missing_and_changed_files(lite, tmp_path, monk
         assert "2 files," in again and f"{files - 2} files present already, with the right hashes" in again
         run_cli("convert", server.url, "--out", tmp_path / "full", "--to", "full")
         assert verify_release(tmp_path / "full", level="deep").ok
-    assert contents(target) == contents(lite[0])
+    assert file_contents(target) == file_contents(lite[0])
 
 
 def test_download_refuses_folders_with_other_content(lite, full, tmp_path):
@@ -217,7 +217,7 @@ def test_download_refuses_folders_with_other_content(lite, full, tmp_path):
         shutil.copytree(full[0], target)
         with pytest.raises(OptionError, match="contains a release that differs"):
             plan_download(server.url, to=target)
-    assert contents(target) == contents(full[0])
+    assert file_contents(target) == file_contents(full[0])
 
 
 KILLED = """
@@ -234,7 +234,7 @@ def test_killed_download_resumes_with_the_missing_files(kind, to, lite, tmp_path
     arguments = [str(tmp_path / to)] if to else []
     with serve_release(kind, lite[0]) as (url, server):
         assert server is not None
-        server.faults.next(Slow(bytes_per_second=2000), times=ALWAYS, path="*.h5")
+        server.faults.next(SlowAnswer(bytes_per_second=2000), times=ALWAYS, path="*.h5")
         environment = os.environ | (server.environment if isinstance(server, Hub) else {})
         running = subprocess.Popen([sys.executable, "-c", KILLED, url, *arguments], env=environment)
         while not [request for request in server.log if request.path.endswith(".h5") and request.sent > 4000]:
@@ -248,24 +248,24 @@ def test_killed_download_resumes_with_the_missing_files(kind, to, lite, tmp_path
         assert not shard_names(folder), "no shard under its name"
         assert len(plan.absent) < len(plan.files) - 4, "complete files are kept"
         fetch_planned(plan)
-        assert contents(folder).items() >= contents(lite[0]).items()
-        assert not to or contents(folder) == contents(lite[0])
+        assert file_contents(folder).items() >= file_contents(lite[0]).items()
+        assert not to or file_contents(folder) == file_contents(lite[0])
 
 
 # Tests of server faults
 
 
 WRONG: dict[str, tuple[Fault, str]] = {
-    "other bytes": (Flip(100), "expected sha256"),
-    "too few": (Short(7), "expected sha256|Consistency"),
-    "too many": (Long(7), "the server sent more|Consistency|RemoteProtocolError"),
-    "nothing": (Short(ALWAYS), "expected sha256|Consistency"),
+    "other bytes": (FlippedByte(100), "expected sha256"),
+    "too few": (ShortBody(7), "expected sha256|Consistency"),
+    "too many": (LongBody(7), "the server sent more|Consistency|RemoteProtocolError"),
+    "nothing": (ShortBody(ALWAYS), "expected sha256|Consistency"),
     "another file": (Redirect(f"/{INFO}"), "expected sha256|the server sent more|no such file"),
     "a loop": (Redirect(f"/{SHARD}"), "TooManyRedirects|no such file"),
-    "absent": (Status(404), "no such file"),
-    "forbidden": (Status(403), "403"),
-    "busy for ever": (Status(503), "503"),
-    "cut for ever": (Cut(1000), "Error"),
+    "absent": (ErrorStatus(404), "no such file"),
+    "forbidden": (ErrorStatus(403), "403"),
+    "busy for ever": (ErrorStatus(503), "503"),
+    "cut for ever": (CutBody(1000), "Error"),
 }
 
 
@@ -291,12 +291,14 @@ def test_permanent_server_errors_are_raised_with_the_file_name(kind, fault, lite
         seen = len(server.log)
         fetch_planned(plan_download(url, to=tmp_path / "mine"))
         assert not [request for request in server.log[seen:] if request.path.endswith("README.md")] or kind == "hub"
-        assert_equal(load_batch(url), load_batch(lite[0]))
-    assert contents(tmp_path / "mine") == contents(lite[0])
+        assert_equal_batches(load_batch(url), load_batch(lite[0]))
+    assert file_contents(tmp_path / "mine") == file_contents(lite[0])
 
 
 @pytest.mark.parametrize(
-    "fault", [Status(503), Status(429, {"Retry-After": "1"}), Status(500), Cut(1000), Cut(0)], ids=str
+    "fault",
+    [ErrorStatus(503), ErrorStatus(429, {"Retry-After": "1"}), ErrorStatus(500), CutBody(1000), CutBody(0)],
+    ids=str,
 )
 @pytest.mark.parametrize("kind", ["http", "hub"])
 def test_transient_errors_are_retried(kind, fault, lite, tmp_path):
@@ -304,11 +306,11 @@ def test_transient_errors_are_retried(kind, fault, lite, tmp_path):
         assert server is not None
         for method in ("GET", "HEAD"):
             for path in ("*.h5", f"*{MANIFEST}", "*/api/*"):
-                if isinstance(fault, Status) or method == "GET":
+                if isinstance(fault, ErrorStatus) or method == "GET":
                     server.faults.next(fault, path=path, method=method)
         plan = plan_download(url, to=tmp_path / "mine")
         fetch_planned(plan)
-    assert contents(tmp_path / "mine") == contents(lite[0])
+    assert file_contents(tmp_path / "mine") == file_contents(lite[0])
 
 
 def test_a_redirect_to_another_host_is_followed(lite, tmp_path):
@@ -321,12 +323,12 @@ def test_a_redirect_to_another_host_is_followed(lite, tmp_path):
 def test_download_stops_at_the_first_failing_file(lite, tmp_path):
     with http_server(lite[0]) as server:
         plan = plan_download(server.url, to=tmp_path / "mine")
-        server.faults.next(Flip(3), times=ALWAYS)
+        server.faults.next(FlippedByte(3), times=ALWAYS)
         seen = len(server.log)
         with pytest.raises(RemoteError, match="expected sha256"):
             fetch_planned(plan)
         assert len(server.log) - seen <= min(len(plan.files), clients.THREADS + 2)
-    assert set(contents(tmp_path / "mine")) - set(plan.absent) == set(contents(tmp_path / "mine"))
+    assert set(file_contents(tmp_path / "mine")) - set(plan.absent) == set(file_contents(tmp_path / "mine"))
 
 
 @pytest.mark.parametrize("what", ["http", "hub", pytest.param("s3", marks=pytest.mark.slow), "refused", "hub refused"])
@@ -352,7 +354,7 @@ def test_server_that_stops_answering_times_out(kind, path, lite, tmp_path, monke
     monkeypatch.setattr(clients, "_TIMEOUT", 0.5)
     with serve_release(kind, lite[0]) as (url, server):
         assert server is not None
-        server.faults.next(Slow(60), times=ALWAYS, path=path, method=None)
+        server.faults.next(SlowAnswer(60), times=ALWAYS, path=path, method=None)
         began = time.monotonic()
         if kind == "hub" or "api" not in path:
             with pytest.raises(RemoteError):
@@ -360,7 +362,7 @@ def test_server_that_stops_answering_times_out(kind, path, lite, tmp_path, monke
         assert time.monotonic() - began < 5
         server.faults.clear()
         fetch_planned(plan_download(url, to=tmp_path / "mine"))
-    assert contents(tmp_path / "mine") == contents(lite[0])
+    assert file_contents(tmp_path / "mine") == file_contents(lite[0])
 
 
 def test_cached_files_can_be_read_when_the_hub_is_unreachable(lite, tmp_path):
@@ -368,7 +370,7 @@ def test_cached_files_can_be_read_when_the_hub_is_unreachable(lite, tmp_path):
         hub.add_repo("org/name", lite[0])
         fetch_planned(plan_download(HUB, layout="demo_wide"))
         hub.close()
-        assert_equal(load_batch(HUB), load_batch(lite[0]))
+        assert_equal_batches(load_batch(HUB), load_batch(lite[0]))
         with pytest.raises(RemoteError, match=f"/{SHARD}: .*ConnectError|/{TABLE}: .*ConnectError"):
             load_batch(HUB, "coord_simple")
 
@@ -380,10 +382,10 @@ def test_cached_files_can_be_read_when_the_hub_is_unreachable(lite, tmp_path):
 @pytest.mark.parametrize("name", [INFO, HISTORIES, TABLE, SHARD])
 def test_changed_cached_file_is_fetched_again(kind, name, lite):
     with serve_release(kind, lite[0]) as (url, _):
-        assert_equal(load_batch(url, "coord_simple"), load_batch(lite[0], "coord_simple"))
+        assert_equal_batches(load_batch(url, "coord_simple"), load_batch(lite[0], "coord_simple"))
         path = load_icrl4aht(url).root / name
         path.resolve().write_bytes(path.read_bytes()[:-5])
-        assert_equal(load_batch(url, "coord_simple"), load_batch(lite[0], "coord_simple"))
+        assert_equal_batches(load_batch(url, "coord_simple"), load_batch(lite[0], "coord_simple"))
         assert path.read_bytes() == (lite[0] / name).read_bytes()
 
 
@@ -399,10 +401,10 @@ def test_damaged_remote_manifests_raise_errors(kind, lite, tmp_path):
         ):
             use(url)
     with http_server(lite[0]) as server:
-        server.faults.next(Flip(70), path=f"*{MANIFEST}")
+        server.faults.next(FlippedByte(70), path=f"*{MANIFEST}")
         with pytest.raises(Icrl4ahtError):
             fetch_planned(plan_download(server.url))
-        assert_equal(load_batch(server.url), load_batch(lite[0]))
+        assert_equal_batches(load_batch(server.url), load_batch(lite[0]))
 
 
 @pytest.mark.parametrize(
@@ -446,7 +448,7 @@ def test_the_token_is_sent_to_the_hub_only(lite):
         ("https://u:p@ss@h.test/a@b", "https://h.test/a@b"),
     ],
 )
-def test_without_credentials_removes_secrets_from_texts(text, expected):
+def test_credentials_are_removed_from_texts(text, expected):
     assert without_credentials(text) == expected
 
 
@@ -468,7 +470,7 @@ def test_credentials_in_an_address_are_used_but_never_stored_or_shown(lite, tmp_
     said, server = [], Server(answer_request)
     url = f"{server.url.replace('http://', 'http://me:hunter2@')}?key=t0ken"
     try:
-        assert_equal(load_batch(url), load_batch(lite[0]))
+        assert_equal_batches(load_batch(url), load_batch(lite[0]))
         said.append(repr(load_icrl4aht(url)))
         for command in (["download", url, "--to", str(tmp_path / "mine")], ["show", url], ["verify", url]):
             said.append(run_cli(*command))
@@ -478,6 +480,6 @@ def test_credentials_in_an_address_are_used_but_never_stored_or_shown(lite, tmp_
             said += [str(caught.value), str(caught.value.__cause__)]
     finally:
         server.close()
-    said += [data_folder.decode(errors="replace") for data_folder in contents(tmp_path).values()]
+    said += [data_folder.decode(errors="replace") for data_folder in file_contents(tmp_path).values()]
     said += [str(path) for path in tmp_path.rglob("*")]
     assert not [text for text in said if "hunter2" in text or "t0ken" in text]

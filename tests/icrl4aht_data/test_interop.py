@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.interop import IGNORED, hf_episodes, hf_index, hf_windows, torch_loader
-from tests.helpers.batches import assert_equal
+from tests.helpers.batches import assert_equal_batches
 from tests.helpers.commands import run_python
 
 
@@ -60,7 +60,7 @@ class TestGrain:
             found = list(source.to_iter_dataset(options))
             assert len(found) == len(sampler)
             for i, batch in enumerate(found):
-                assert_equal(batch, sampler[i])
+                assert_equal_batches(batch, sampler[i])
 
 
 ONE_CORE = "ignore:This DataLoader will create:UserWarning"
@@ -100,19 +100,13 @@ COMBINATIONS = [
 ]
 
 
-@pytest.mark.parametrize(
-    "combinations",
-    [
-        pytest.param([("mmap", "ad", 1, "spawn")], id="one"),
-        pytest.param(COMBINATIONS, id="all", marks=pytest.mark.slow),
-    ],
-)
-def test_pytorch_workers_return_the_batches_of_the_sampler(lite, tmp_path, combinations):
+@pytest.mark.slow
+def test_pytorch_workers_return_the_batches_of_the_sampler(lite, tmp_path):
     """Run in a separate process, because a process that has run JAX must not fork."""
     script = tmp_path / "loader.py"
     script.write_text(TORCH)
-    printed = run_python("-W", "error", "-W", ONE_CORE, script, lite[0], json.dumps(combinations))
-    assert len(printed.splitlines()) == len(combinations)
+    printed = run_python("-W", "error", "-W", ONE_CORE, script, lite[0], json.dumps(COMBINATIONS))
+    assert len(printed.splitlines()) == len(COMBINATIONS)
 
 
 class TestHuggingFace:

@@ -13,14 +13,22 @@ from icrl4aht_data.interop import torch_loader
 
 
 @pytest.fixture(scope="module")
-def bundle() -> Dataset:
+def bundled_dataset() -> Dataset:
     return load_icrl4aht()
 
 
-def test_repr_of_objects_fits_one_screen(bundle):
-    sampler, history = bundle.filter(layout="demo_wide").ad(batch_size=2, length=30), bundle[0]
+def test_repr_of_objects_fits_one_screen(bundled_dataset):
+    sampler, history = bundled_dataset.filter(layout="demo_wide").ad(batch_size=2, length=30), bundled_dataset[0]
     report = Report("release", findings=[Finding(f"file {number}", "x" * 1000) for number in range(300)])
-    objects = [bundle, bundle.index, bundle.info, bundle.provenance, bundle.cache, history, history.entry]
+    objects = [
+        bundled_dataset,
+        bundled_dataset.index,
+        bundled_dataset.info,
+        bundled_dataset.provenance,
+        bundled_dataset.cache,
+        history,
+        history.entry,
+    ]
     objects += [history.actions, history.plot(), history.episodes, history.episodes[0], sampler, sampler[0], report]
     for value in objects:
         text = repr(value)
@@ -28,8 +36,8 @@ def test_repr_of_objects_fits_one_screen(bundle):
         assert 1 <= lines <= 24 and " object at 0x" not in text, text
 
 
-def test_repr_of_batches_shows_dtypes_and_shapes(bundle):
-    sampler = bundle.filter(layout="demo_wide").with_options(obs="uint8").ad(batch_size=2, length=30)
+def test_repr_of_batches_shows_dtypes_and_shapes(bundled_dataset):
+    sampler = bundled_dataset.filter(layout="demo_wide").with_options(obs="uint8").ad(batch_size=2, length=30)
     lines = repr(sampler[0]).splitlines()
     assert lines[0] == "ADBatch("
     assert [line.split() for line in lines[1:3]] == [

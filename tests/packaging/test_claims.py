@@ -54,13 +54,13 @@ NUMBER = rf"(-?\d[\d,]*(?:\.\d+)?(?:e\d+)?|\b(?:{'|'.join(WORDS)})\b)"
 
 
 @cache
-def entries() -> tuple[Entry, ...]:
+def bundled_entries() -> tuple[Entry, ...]:
     return tuple(read_index(MINI).entries)
 
 
 def count_rising_entries() -> tuple[float, ...]:
-    rising = [entry for entry in entries() if entry.return_end - entry.return_start >= LEAST_HEADROOM]
-    return len(rising), len(entries()), LEAST_HEADROOM
+    rising = [entry for entry in bundled_entries() if entry.return_end - entry.return_start >= LEAST_HEADROOM]
+    return len(rising), len(bundled_entries()), LEAST_HEADROOM
 
 
 def count_best_responses() -> tuple[int, int]:
@@ -90,12 +90,12 @@ def paper_plan_sizes() -> tuple[float, ...]:
 
 
 def range_over_layouts(count: Callable[[Layout], int]) -> tuple[int, int]:
-    """Return the smallest and the largest count of a published layout."""
+    """Count something on each published layout; return the smallest and the largest count."""
     counts = [count(layout) for layout in LAYOUTS.values()]
     return min(counts), max(counts)
 
 
-def most_validation_tasks_of_a_layout() -> int:
+def max_validation_tasks_per_layout() -> int:
     return max(Counter(task.layout.name for task in bundled_tasks("validation")).values())
 
 
@@ -119,8 +119,9 @@ def count_test_behaviours() -> tuple[int, ...]:
 
 def bundled_release_size() -> tuple[int, ...]:
     size = sum(path.stat().st_size for path in MINI.rglob("*") if path.is_file())
-    layouts, tasks_ = {entry.layout for entry in entries()}, {entry.task_id for entry in entries()}
-    return len(entries()), len(tasks_), len(layouts), sum(entry.T for entry in entries()), round(size / 1e6)
+    entries = bundled_entries()
+    layouts, tasks = {entry.layout for entry in entries}, {entry.task_id for entry in entries}
+    return len(entries), len(tasks), len(layouts), sum(entry.T for entry in entries), round(size / 1e6)
 
 
 CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
@@ -133,7 +134,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/evaluating", "of {} episodes with {} steps each", lambda: (SEEDED.episodes, SEEDED.steps)),
     ("docs/evaluating", "canonical channels, the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
     ("docs/evaluating", "more than `stay` in {} of the {} cells", count_cells_without_headroom),
-    ("docs/protocol", "choices.md): up to {} [drawn", most_validation_tasks_of_a_layout),
+    ("docs/protocol", "choices.md): up to {} [drawn", max_validation_tasks_per_layout),
     ("docs/protocol", "scripts of {} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),
     ("docs/protocol", "{} of its modes do not cooperate", lambda: TERRITORY.choices["behavior_mode"] - 1),
     (

@@ -35,7 +35,7 @@ from icrl4aht_data.writing.convert import to_release
 from tests.helpers.commands import run_cli
 from tests.helpers.damages import flip_bit
 from tests.helpers.paths import ROOT
-from tests.helpers.plugins import installed, write_package
+from tests.helpers.plugins import installed_plugins, write_package
 from tests.helpers.random_releases import random_history, random_release
 from tests.helpers.tiny import TINY
 from tests.packaging.test_readme import check_arguments, code_blocks, shell_calls
@@ -70,7 +70,7 @@ def run_snippets(page: str, folder: Path) -> dict[str, Any]:
 
 
 def table_rows(page: str, heading: str) -> list[list[str]]:
-    """Return the rows of the Markdown table with this heading of the first column, as cells without backticks."""
+    """Return the rows of the Markdown table whose first column has this heading, as cells without backticks."""
     (table,) = re.findall(rf"^\| {heading} \|.*?\n\|[-|]+\n((?:\|.*\n)+)", PAGES[page], flags=re.MULTILINE)
     return [[cell.strip().replace("`", "") for cell in line.strip("| ").split(" | ")] for line in table.splitlines()]
 
@@ -96,7 +96,7 @@ def example_package(tmp_path) -> Iterator[None]:
     source = DOCS / "my_overcooked"
     project = tomllib.loads((source / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     modules = {path.stem: path.read_text(encoding="utf-8") for path in (source / "my_overcooked").glob("*.py")}
-    with installed(write_package(tmp_path / "site", project["name"], modules, project["entry-points"])):
+    with installed_plugins(write_package(tmp_path / "site", project["name"], modules, project["entry-points"])):
         yield
 
 
@@ -155,13 +155,13 @@ def test_names_in_pages_exist(page):
 
 
 @pytest.fixture(scope="module")
-def reader() -> dict[str, Any]:
+def reader_functions() -> dict[str, Any]:
     """Return the functions of docs/read_release.py, by name."""
     return runpy.run_path(str(DOCS / "read_release.py"))
 
 
 class TestFormatPage:
-    def test_read_release_script_returns_the_arrays_of_the_package(self, reader, lite, full, tmp_path):
+    def test_read_release_script_returns_the_arrays_of_the_package(self, reader_functions, lite, full, tmp_path):
         to_release(load_icrl4aht(full[0]), tmp_path / "observations", "observations")
         random_release(tmp_path / "shards", labels=False, shard_histories=4)
         random_release(tmp_path / "oracle", layouts=("coord_simple",), oracle=True)
@@ -170,33 +170,35 @@ class TestFormatPage:
             for number in (0, 31, 79, 80) if root is MINI else range(len(dataset)):
                 history = dataset[number]
                 for field in history.entry.stored_fields(dataset.info.kind):
-                    array = reader["read"](root, number, field.name)
+                    array = reader_functions["read"](root, number, field.name)
                     assert array.dtype == field.element(LAYOUTS[history.entry.layout], dataset.info.kind).base
                     np.testing.assert_array_equal(array, history.read(field.name))
         with pytest.raises(KeyError):
-            reader["read"](tmp_path / "shards", 0, "expert_actions")
+            reader_functions["read"](tmp_path / "shards", 0, "expert_actions")
 
-    def test_read_release_script_raises_error_on_damaged_bytes(self, reader, damaged):
-        shard = damaged / load_icrl4aht(damaged).entries[0].shard
-        table = np.load(damaged / "meta/chunks" / shard.relative_to(damaged / "data").with_suffix(".npy"))
+    def test_read_release_script_raises_error_on_damaged_bytes(self, reader_functions, release_copy):
+        shard = release_copy / load_icrl4aht(release_copy).entries[0].shard
+        table = np.load(release_copy / "meta/chunks" / shard.relative_to(release_copy / "data").with_suffix(".npy"))
         flip_bit(shard, int(table["offset"][0]) + 5)
         with pytest.raises(ValueError, match="are damaged"):
-            reader["read"](damaged, 0, "state")
+            reader_functions["read"](release_copy, 0, "state")
 
     @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=str)
-    def test_read_release_script_unpacks_and_observes_like_the_package(self, reader, layout):
-        parsed = reader["parse_layout"]({"map": layout.rows, "obs_shape": layout.obs_shape})
+    def test_read_release_script_unpacks_and_observes_like_the_package(self, reader_functions, layout):
+        parsed = reader_functions["parse_layout"]({"map": layout.rows, "obs_shape": layout.obs_shape})
         assert parsed["S"] == state.record_size(layout)
-        assert reader["canonical_positions"](parsed) == canonical_positions(layout).tolist()
+        assert reader_functions["canonical_positions"](parsed) == canonical_positions(layout).tolist()
         for part in ("pots", "buttons", "counters"):
             assert tuple(parsed[part]) == getattr(layout, part)
         records = random_history(layout, 3, 60, np.random.default_rng(0))["state"][::4]
         parts = state.unpack(layout, records)
         for number, record in enumerate(records):
-            for ours, values in zip(parts, reader["unpack"](parsed, record).values(), strict=True):
+            for ours, values in zip(parts, reader_functions["unpack"](parsed, record).values(), strict=True):
                 np.testing.assert_array_equal(values, np.atleast_1d(ours[number]))
             for agent in (0, 1):
-                np.testing.assert_array_equal(reader["observe"](parsed, record, agent), observe(layout, record, agent))
+                np.testing.assert_array_equal(
+                    reader_functions["observe"](parsed, record, agent), observe(layout, record, agent)
+                )
 
     def test_format_page_lists_the_arrays_of_the_schema(self):
         arrays = [cells[:5] for cells in table_rows("format", "array")]
@@ -237,7 +239,7 @@ SMALL = "--steps 3 --width 16 --heads 2 --batch-size 2 --context 40"
 @pytest.mark.slow
 @pytest.mark.usefixtures("example_package")
 def test_snippets_and_commands_of_the_extending_page_run(tmp_path, monkeypatch):
-    """The commands find the registered objects, without the method that a snippet adds."""
+    """Commands run without the method that a snippet registers, and use the objects of the example package."""
     with mock.patch.dict(METHODS):
         names = run_snippets("extending", tmp_path)
     assert names["task"].teammate_family == "waiter"

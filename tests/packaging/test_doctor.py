@@ -96,15 +96,15 @@ def test_doctor_reports_invalid_environment_variables(doctor_folder, monkeypatch
     assert remote == "ICRL4AHT_REMOTE='example.org/icrl4aht': expected an address"
 
 
-def test_doctor_reports_a_damaged_bundled_release(doctor_folder, monkeypatch, damaged):
-    shard = damaged / SHARD
+def test_doctor_reports_a_damaged_bundled_release(doctor_folder, monkeypatch, release_copy):
+    shard = release_copy / SHARD
     shard.write_bytes(shard.read_bytes()[:-1])
-    monkeypatch.setattr(doctor, "MINI", damaged)
+    monkeypatch.setattr(doctor, "MINI", release_copy)
     monkeypatch.setattr(doctor, "verify_release", verify_release)
     ((problem, step),) = reported_problems().items()
     assert problem.startswith(f"the bundled release, {SHARD}: ")
     assert step == RESTORE
-    (damaged / "meta/info.json").unlink()
+    (release_copy / "meta/info.json").unlink()
     assert any("meta/info.json" in problem for problem in reported_problems())
 
 

@@ -34,7 +34,7 @@ HEAVY = {*JAX, *PICTURES, "torch", "datasets", "huggingface_hub", "grain", "pyar
 
 
 class Import(NamedTuple):
-    """Target of one import statement.
+    """One import in a module of the project.
 
     Attributes:
         importer: name of the importing module, such as "package.folder.file".

@@ -1,4 +1,4 @@
-"""Test that bad input on the command line gives an exit code and one message with fault and remedy."""
+"""Test that bad input on the command line gives an exit code and one message that names fault and remedy."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_empty_arguments_are_refused(run_program):
         (errno.EIO, "x.h5", "error: x.h5: Input/output error\n"),
     ],
 )
-def test_disk_errors_name_the_file_of_the_user(capsys, number, name, message):
+def test_disk_errors_name_the_file_that_the_user_gave(capsys, number, name, message):
     with pytest.raises(SystemExit) as stop:
         run_failing(OSError(number, "in other words", name))
     assert stop.value.code == 1

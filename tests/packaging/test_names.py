@@ -27,7 +27,8 @@ def public_names(tree: ast.Module) -> Iterator[str]:
         elif isinstance(node, ast.Assign | ast.AnnAssign) and "TypeVar(" not in ast.unparse(node):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             found = [name for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
-            names = [name.id for name in found if isinstance(name.ctx, ast.Store)]  # only assigned names
+            # Names that are only read are left out.
+            names = [name.id for name in found if isinstance(name.ctx, ast.Store)]
         else:
             names = []
         yield from (name for name in names if not name.startswith("_"))

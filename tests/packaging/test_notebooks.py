@@ -7,7 +7,7 @@ import re
 import nbformat
 import pytest
 
-from tests.helpers.notebooks import NOTEBOOKS, execute, outputs
+from tests.helpers.notebooks import NOTEBOOKS, cell_outputs, execute_notebook
 from tests.helpers.paths import ROOT
 
 EVERY_NOTEBOOK = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -28,7 +28,7 @@ def test_stored_outputs_are_complete_and_small(path):
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
-    found = list(outputs(notebook))
+    found = list(cell_outputs(notebook))
     assert not [output for output in found if output.output_type == "error"]
     assert re.search("image/(png|gif)", str([output.get("data") for output in found]))
     text = path.read_text(encoding="utf-8")
@@ -46,7 +46,7 @@ def test_files_linked_from_notebooks_exist(path):
 @pytest.mark.slow
 @EVERY_NOTEBOOK
 def test_notebook_runs_without_errors(path, tmp_path):
-    executed, stored = execute(path, tmp_path, SMALLER), nbformat.read(path, as_version=4)
+    executed, stored = execute_notebook(path, tmp_path, SMALLER), nbformat.read(path, as_version=4)
     assert len(executed.cells) == len(stored.cells)
     assert [bool(cell.get("outputs")) for cell in executed.cells] == [
         bool(cell.get("outputs")) for cell in stored.cells

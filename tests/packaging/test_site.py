@@ -75,6 +75,7 @@ def site(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_site_loads_nothing_from_other_hosts(site):
     pages = {path.relative_to(site).as_posix(): path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
     assert {"index.html", "loading.html", "api/datasets.html"} <= pages.keys()
@@ -86,6 +87,7 @@ def test_the_site_loads_nothing_from_other_hosts(site):
     assert 'id="one-history"' in pages["notebooks/explore.html"] and "data:image/png" in pages["notebooks/explore.html"]
 
 
+@pytest.mark.slow
 @NEEDS_CHROMIUM
 def test_site_opened_from_disk_can_be_searched(site):
     from playwright.sync_api import sync_playwright

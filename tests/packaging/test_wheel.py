@@ -110,35 +110,35 @@ def install_packages(*arguments: str | Path) -> None:
 
 
 @pytest.fixture(scope="session")
-def backend(tmp_path_factory) -> Path:
+def build_requirements(tmp_path_factory) -> Path:
     """Return a folder with the installed build requirements."""
     folder = tmp_path_factory.mktemp("backend")
     install_packages(sys.executable, "--target", folder, *PROJECT["build-system"]["requires"])
     return folder
 
 
-def build_archive(backend: Path, source: Path, target: Path, kind: str) -> Path:
+def build_archive(build_requirements: Path, source: Path, target: Path, kind: str) -> Path:
     """Build the wheel or the source archive of a folder, and return its path."""
     command = (sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", target)
-    done = run_isolated(*command, cwd=source, env={"PYTHONPATH": str(backend)})
+    done = run_isolated(*command, cwd=source, env={"PYTHONPATH": str(build_requirements)})
     assert done.returncode == 0, done.stderr
     (path,) = target.iterdir()
     return path
 
 
 @pytest.fixture(scope="session")
-def sdist(backend, tmp_path_factory) -> Path:
+def sdist(build_requirements, tmp_path_factory) -> Path:
     """Return the folder of the unpacked source archive."""
     folder = tmp_path_factory.mktemp("sdist")
-    with tarfile.open(build_archive(backend, ROOT, folder / "packed", "sdist")) as archive:
+    with tarfile.open(build_archive(build_requirements, ROOT, folder / "packed", "sdist")) as archive:
         archive.extractall(folder, filter="data")
     return folder / f"{READER}-{VERSION}"
 
 
 @pytest.fixture(scope="session")
-def wheel(backend, sdist, tmp_path_factory) -> Path:
+def wheel(build_requirements, sdist, tmp_path_factory) -> Path:
     """Return the wheel, built from the source archive as for publication."""
-    return build_archive(backend, sdist, tmp_path_factory.mktemp("wheel"), "wheel")
+    return build_archive(build_requirements, sdist, tmp_path_factory.mktemp("wheel"), "wheel")
 
 
 def files_below(folder: Path) -> set[str]:
@@ -248,7 +248,7 @@ def test_user_packages_with_equal_folder_names_do_not_break_commands(bare_enviro
 
 
 def test_extras_named_in_messages_allow_training_and_drawing(jax_environment, wheel, tmp_path):
-    """The extra `jax` is enough to train and evaluate models; the install command in messages adds drawing."""
+    """The extra `jax` is enough to train and evaluate models; the install command that messages give adds drawing."""
     run = command_runner(jax_environment, tmp_path)
     run("python", "-c", EVALUATE)
     assert "ad-reference" in run("icrl4aht-data", "models")

@@ -18,7 +18,7 @@ PAGE = 4096
 
 
 class HungError(Exception):
-    """Error of a block that exceeds its time limit; not an OSError, which tested code might catch."""
+    """Error raised in a block that exceeds its time limit; not an OSError, because tested code might catch OSErrors."""
 
 
 @contextmanager

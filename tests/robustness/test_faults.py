@@ -28,17 +28,17 @@ from icrl4aht_data.format.manifest import parse_manifest, write_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, memory_fields
 from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.utils.files import atomic_write
-from tests.helpers.damages import contents
+from tests.helpers.damages import file_contents
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import random_release
 from tests.robustness.limits import PAGE, can_mount, file_size_limit, memory_limit, small_disk, time_limit
-from tests.servers.faults import Slow
+from tests.servers.faults import SlowAnswer
 from tests.servers.http import http_server
 
 SLOW = pytest.mark.slow
 
 
-def digest(arrays: Iterable[np.ndarray]) -> bytes:
+def arrays_digest(arrays: Iterable[np.ndarray]) -> bytes:
     found = hashlib.blake2b()
     for array in arrays:
         found.update(f"{array.dtype} {array.shape}".encode() + array.tobytes())
@@ -52,7 +52,9 @@ def hash_batches(dataset: Dataset) -> bytes:
         samplers.append(part.ad(batch_size=8, length=20, teammate_actions=True))
         samplers.append(part.ad(batch_size=4, length=7, seed=1, episodes=(1, 4)))
         samplers.append(part.dpt(batch_size=4, context=20))
-    return digest(array for sampler in samplers for array in sampler.batch(3)._asdict().values() if array is not None)
+    return arrays_digest(
+        array for sampler in samplers for array in sampler.batch(3)._asdict().values() if array is not None
+    )
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +79,7 @@ def cache_folder(tmp_path, monkeypatch) -> Path:
 
 
 class DamagedCopy:
-    """Small release whose files tests damage, and the data read from it before any damage."""
+    """A small release, in which tests damage files, and the data read before any damage."""
 
     def __init__(self, root: Path) -> None:
         random_release(root, teammates=2, streams=1, episodes=6, length=15)
@@ -88,7 +90,7 @@ class DamagedCopy:
         """Return a hash of all arrays and of batches, and the metadata as text."""
         dataset = load_icrl4aht(root, obs="uint8", cache=cache, threads=1)
         names = {h: [one.name for one in memory_fields(dataset.info.kind) if h.entry.has(one)] for h in dataset}
-        arrays = digest(itertools.chain.from_iterable([h.obs[:], *map(h.read, names[h])] for h in names))
+        arrays = arrays_digest(itertools.chain.from_iterable([h.obs[:], *map(h.read, names[h])] for h in names))
         histories = [(repr(h.entry), dataset.recover_teammate(h.entry.history_id)) for h in dataset]
         return arrays + hash_batches(dataset), f"{histories} {dataset.info}"
 
@@ -117,7 +119,7 @@ def small_release(tmp_path_factory) -> DamagedCopy:
 
 @pytest.mark.parametrize("count", [9, pytest.param(90, marks=SLOW)])
 def test_flipped_bit_never_changes_the_data_that_is_read(small_release, cache_folder, count):
-    """Damage all files in turn and read in all cache modes; test_verify.py flips hundreds of bits."""
+    """Flip a bit of one file after another and read in different cache modes; test_verify.py flips more bits."""
     rng, paths = np.random.default_rng(1), sorted(path for path in small_release.root.rglob("*") if path.is_file())
     modes: list[CacheMode] = ["ram", "stream", "mmap"]
     for number in range(count):
@@ -133,7 +135,7 @@ RAW = [b"NaN", b"1e999", b"[" * 100_000, b'{"a":' * 50_000, b'"' + b"x" * 10_000
 
 
 def mutate(data: bytes, rng: np.random.Generator) -> bytes:
-    """Return `data` with a part removed, with other bytes, or with another JSON value."""
+    """Return the content of a file with a part removed, with other bytes, or with another JSON value."""
     low, high = sorted(rng.integers(len(data) + 1, size=2).tolist())
     found = list(re.finditer(rb'(?<=[:\[,] )(?:"[^"]*"|-?[\d.]+|true|false|null)', data)) or [re.match(b"", data)]
     value = found[rng.integers(len(found))]
@@ -184,7 +186,7 @@ DISKS = pytest.mark.parametrize(
 @DISKS
 @pytest.mark.parametrize("share", [0.3, 0.8])
 def test_a_download_that_fills_the_disk_is_resumed(release, tmp_path, share, mounted):
-    right, to = contents(release), tmp_path / "disk" / "release"
+    right, to = file_contents(release), tmp_path / "disk" / "release"
     sizes = [len(data) for data in right.values()]
     size = int(share * (sum(sizes) if mounted else max(sizes))) // PAGE * PAGE
     with http_server(release) as server, limit_space(to.parent, size, mounted) as enlarge:
@@ -192,10 +194,10 @@ def test_a_download_that_fills_the_disk_is_resumed(release, tmp_path, share, mou
             fetch_planned(plan_download(server.url, to=to))
         error = caught.value
         assert isinstance(error, Icrl4ahtError) or error.errno in (errno.ENOSPC, errno.EFBIG), repr(error)
-        assert (contents(to) if to.exists() else {}).items() <= right.items()
+        assert (file_contents(to) if to.exists() else {}).items() <= right.items()
         enlarge()
         fetch_planned(plan_download(server.url, to=to))
-        assert contents(to) == right
+        assert file_contents(to) == right
 
 
 @DISKS
@@ -220,7 +222,7 @@ CODE = {
 
 
 def start_process(code: str, *arguments: object) -> subprocess.Popen[str]:
-    """Start a Python process that runs `code` once a line arrives on stdin; return when the process waits."""
+    """Start a Python process that waits for a line on stdin and then runs `code`; return when the process waits."""
     imports = """
 import sys
 from pathlib import Path
@@ -241,7 +243,7 @@ sys.stdin.readline()
 def test_two_processes_can_share_a_download_or_cache(release, batches_hash, cache_folder, tmp_path, what):
     to = tmp_path / "copy"
     with http_server(release) as server:
-        server.faults.next(Slow(0.01), times=10**9)
+        server.faults.next(SlowAnswer(0.01), times=10**9)
         root = release if what == "build" else server.url
         processes = [start_process(CODE[what], root, to) for _ in range(2)]
         for process in processes:
@@ -251,12 +253,12 @@ def test_two_processes_can_share_a_download_or_cache(release, batches_hash, cach
         errors = [process.communicate()[1] for process in processes]
     assert [process.returncode for process in processes] == [0, 0], errors
     if what == "download":
-        assert contents(to) == contents(release)
+        assert file_contents(to) == file_contents(release)
     if what == "build":
         assert {path.name.split("-")[0] for path in cache_folder.iterdir()} <= {"histories"}
-        made = contents(cache_folder)
+        made = file_contents(cache_folder)
         assert hash_batches(load_icrl4aht(release, obs="uint8", cache="mmap")) == batches_hash
-        assert contents(cache_folder) == made, "built again"
+        assert file_contents(cache_folder) == made, "built again"
 
 
 @SLOW

@@ -26,7 +26,7 @@ from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.utils.files import atomic_write, parse_json, resolve_inside
 from tests.helpers.commands import run_cli
 from tests.robustness.hostile.cases import CASES, TERABYTE
-from tests.robustness.hostile.run import bound_process, make_valid_inputs, run_case
+from tests.robustness.hostile.run import limit_process, make_valid_inputs, run_case
 
 SECONDS = 400
 """Time for one case."""
@@ -42,7 +42,7 @@ def run_hostile_case(tmp_path_factory) -> Iterator[Callable[[str], dict[str, Any
     context = multiprocessing.get_context("spawn")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("OPENBLAS_NUM_THREADS", "1")
-        with ProcessPoolExecutor(1, context, initializer=bound_process) as pool:
+        with ProcessPoolExecutor(1, context, initializer=limit_process) as pool:
             yield lambda name: pool.submit(run_case, folder, name).result(SECONDS)
 
 
@@ -109,11 +109,11 @@ def test_atomic_write_does_not_follow_links(tmp_path):
     assert ((tmp_path / "mine").read_text(), (tmp_path / "file").read_text()) == ("mine", "new")
 
 
-def test_names_are_printed_without_interpreting_markup(damaged):
-    path = damaged / "meta" / "histories.jsonl"
+def test_names_are_printed_without_interpreting_markup(release_copy):
+    path = release_copy / "meta" / "histories.jsonl"
     path.write_text(path.read_text().replace("_coord_", "[/b][link=file:///]_coord_"))
-    write_manifest(damaged)
-    assert "[/b][link=file:///]" in run_cli("list", damaged)
+    write_manifest(release_copy)
+    assert "[/b][link=file:///]" in run_cli("list", release_copy)
 
 
 def test_parse_json_limits_the_depth_of_nesting():
@@ -140,16 +140,16 @@ FOREIGN = (
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_unknown_file_names_in_a_manifest_are_refused(damaged, name):
+def test_unknown_file_names_in_a_manifest_are_refused(release_copy, name):
     line = f"{'0' * 64}  {name}\n"
     with pytest.raises(UnsafePathError, match=r"not a file that a release may contain|points outside"):
         parse_manifest(line, "MANIFEST")
-    with (damaged / MANIFEST).open("a") as stream:
+    with (release_copy / MANIFEST).open("a") as stream:
         stream.write(line)
-    assert MANIFEST in verify_release(damaged).files_at_fault
-    (damaged / "sitecustomize.py").write_text("")
+    assert MANIFEST in verify_release(release_copy).files_at_fault
+    (release_copy / "sitecustomize.py").write_text("")
     with pytest.raises(UnsafePathError, match=r"'sitecustomize\.py' is not a file that a release may .*; remove it"):
-        write_manifest(damaged)
+        write_manifest(release_copy)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Faults that a test server makes on purpose, and rules for when they happen."""
+"""Faults that a test server injects into its answers, and rules that choose the requests."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 class Request:
     """A request in a server's log, logged before the first byte of the answer is sent.
 
-    The fields `status` and `sent` are set later: rules for faults cannot use them.
+    The fields `status` and `sent` are set later, so rules for faults cannot use them.
 
     Args:
         method: HTTP method, such as GET or HEAD.
@@ -33,14 +33,14 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Cut:
+class CutBody:
     """Send correct headers and the first `after` bytes of the body, then close the connection."""
 
     after: int = 0
 
 
 @dataclass(frozen=True)
-class Status:
+class ErrorStatus:
     """Answer with an HTTP error status and a line of text instead of the content."""
 
     code: int
@@ -48,7 +48,7 @@ class Status:
 
 
 @dataclass(frozen=True)
-class Slow:
+class SlowAnswer:
     """Wait `delay` seconds before the answer, then send at most `bytes_per_second`."""
 
     delay: float = 0.0
@@ -56,21 +56,21 @@ class Slow:
 
 
 @dataclass(frozen=True)
-class Short:
-    """Send `by` bytes less than requested, with a matching Content-Length."""
+class ShortBody:
+    """Send `by` bytes fewer than requested, with a matching Content-Length."""
 
     by: int = 1
 
 
 @dataclass(frozen=True)
-class Long:
+class LongBody:
     """Send `by` bytes more than requested, with a matching Content-Length; bytes past the file's end are zeros."""
 
     by: int = 1
 
 
 @dataclass(frozen=True)
-class Flip:
+class FlippedByte:
     """Send a body of the right length, with the bits of the byte at `position` inverted."""
 
     position: int = 0
@@ -83,15 +83,12 @@ class Redirect:
     to: str
 
 
-Fault = Cut | Status | Slow | Short | Long | Flip | Redirect
+Fault = CutBody | ErrorStatus | SlowAnswer | ShortBody | LongBody | FlippedByte | Redirect
 Rule = Callable[[Request], Fault | None]
 
 
 class Faults:
-    """A list of rules: the first rule that returns a fault decides the fault of a request. Thread safe.
-
-    The path of a rule is a pattern of fnmatch (`*` also matches `/`); The method None matches any method.
-    """
+    """A thread-safe list of rules; a request gets the fault of the first rule that returns a fault."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -102,12 +99,15 @@ class Faults:
             return next((fault for rule in self._rules if (fault := rule(request)) is not None), None)
 
     def add(self, rule: Rule) -> None:
-        """Add a function that returns a request's fault or None; a lock guards its calls, so it may count requests."""
+        """Add a rule, a function that returns the fault of a request or None; calls are locked, so a rule may count."""
         with self._lock:
             self._rules.append(rule)
 
     def next(self, fault: Fault, times: int = 1, path: str = "*", method: str | None = "GET") -> None:
-        """Add a fault that applies to the next `times` requests that match `path` and `method`."""
+        """Add a fault for the next `times` requests that match `path` and `method`.
+
+        The path is a pattern of fnmatch (`*` also matches `/`); the method None matches any method.
+        """
         left = times
 
         def rule(request: Request) -> Fault | None:

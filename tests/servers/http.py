@@ -1,4 +1,4 @@
-"""Serve a folder over HTTP on 127.0.0.1, with the server class that the test Hub uses too."""
+"""An HTTP server on 127.0.0.1 that can inject faults, and a function that serves the files of a folder."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from typing import Any, BinaryIO, cast
 from urllib.parse import unquote, urlsplit
 
 from tests.servers.faults import (
-    Cut,
+    CutBody,
+    ErrorStatus,
     Fault,
     Faults,
-    Flip,
-    Long,
+    FlippedByte,
+    LongBody,
     Redirect,
     Request,
-    Short,
-    Slow,
-    Status,
+    ShortBody,
+    SlowAnswer,
 )
 
 BLOCK = 1 << 16
@@ -96,13 +96,13 @@ class Server(ThreadingHTTPServer):
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Handler of one connection to the server."""
+    """Answer the requests of one connection."""
 
     protocol_version = "HTTP/1.1"
     disable_nagle_algorithm = True
 
     @property
-    def owner(self) -> Server:
+    def test_server(self) -> Server:
         return cast(Server, self.server)
 
     def log_message(self, format: str, *args) -> None:
@@ -112,22 +112,22 @@ class Handler(BaseHTTPRequestHandler):
         body = self._read(int(self.headers.get("Content-Length") or 0))
         path = unquote(urlsplit(self.path).path)
         request = Request(self.command, path, self.path, self.headers)
-        fault = self.owner.faults(request)
-        self.owner.log.append(request)
-        if isinstance(fault, Slow):
-            self.owner.closing.wait(fault.delay)
-        if isinstance(fault, Status):
+        fault = self.test_server.faults(request)
+        self.test_server.log.append(request)
+        if isinstance(fault, SlowAnswer):
+            self.test_server.closing.wait(fault.delay)
+        if isinstance(fault, ErrorStatus):
             answer = Answer(b"error requested by the test\n", fault.code, fault.headers)
         elif isinstance(fault, Redirect):
             answer = Answer(b"", 302, {"Location": fault.to})
         else:
-            answer = self.owner.route(request, body)
+            answer = self.test_server.route(request, body)
         self._send(request, answer, fault)
 
     do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = answer
 
     def _read(self, size: int) -> bytes:
-        """Read the complete body of a request; the client may close the connection before its end."""
+        """Return the complete body of a request; raise ConnectionAbortedError if the client sends less."""
         found = self.rfile.read(size)
         if len(found) < size:
             raise ConnectionAbortedError(f"{self.path}: received {len(found)} of {size} bytes of the request")
@@ -137,7 +137,7 @@ class Handler(BaseHTTPRequestHandler):
         with _open_body(answer.body) as file:
             size = os.fstat(file.fileno()).st_size if isinstance(answer.body, Path) else len(answer.body)
             if size:
-                size += fault.by if isinstance(fault, Long) else -fault.by if isinstance(fault, Short) else 0
+                size += fault.by if isinstance(fault, LongBody) else -fault.by if isinstance(fault, ShortBody) else 0
             request.status, length = answer.status, max(0, size)
             self.send_response(answer.status)
             for name, value in (answer.headers | {"Content-Length": str(length)}).items():
@@ -147,11 +147,11 @@ class Handler(BaseHTTPRequestHandler):
                 self._send_body(request, file, length, fault)
 
     def _send_body(self, request: Request, file: BinaryIO, length: int, fault: Fault | None) -> None:
-        pace = fault.bytes_per_second if isinstance(fault, Slow) else None
+        pace = fault.bytes_per_second if isinstance(fault, SlowAnswer) else None
         most = BLOCK if pace is None else max(1, int(pace * PACE))
-        flipped = fault.position % length if isinstance(fault, Flip) and length else -1
-        end = min(length, fault.after) if isinstance(fault, Cut) else length
-        self.close_connection |= isinstance(fault, Cut)
+        flipped = fault.position % length if isinstance(fault, FlippedByte) and length else -1
+        end = min(length, fault.after) if isinstance(fault, CutBody) else length
+        self.close_connection |= isinstance(fault, CutBody)
         while request.sent < end:
             count = min(most, end - request.sent)
             block = bytearray(file.read(count).ljust(count, b"\0"))
@@ -159,7 +159,7 @@ class Handler(BaseHTTPRequestHandler):
                 block[flipped - request.sent] ^= 0xFF
             request.sent += count
             self.wfile.write(block)
-            if pace is not None and self.owner.closing.wait(count / pace):
+            if pace is not None and self.test_server.closing.wait(count / pace):
                 self.close_connection = True
                 return
 
@@ -170,7 +170,7 @@ def _open_body(body: bytes | Path) -> BinaryIO:
 
 @contextmanager
 def http_server(folder: Path, faults: Faults | None = None) -> Iterator[Server]:
-    """Serve the files of a folder, without listings of folders."""
+    """Serve the files of a folder, without listings of folders; yield the server."""
     root = folder.resolve()
 
     def route(request: Request, body: bytes) -> Answer:

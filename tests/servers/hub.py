@@ -11,16 +11,16 @@ from urllib.parse import unquote, urlsplit
 
 from tests.servers.faults import Faults, Request
 from tests.servers.http import Answer, Server
-from tests.servers.hub_repos import HubState, Refusal, Repo, is_large
+from tests.servers.hub_repos import HubError, HubState, Repo, is_large
 from tests.servers.hub_routes import ROUTES, HubRequest
 from tests.servers.process import hub_environment, hub_settings
 
 
 class Hub(HubState):
-    """A running test Hub; the variables in `environment` direct another process to the Hub.
+    """A running test Hub; the environment variables in `environment` direct other processes to the Hub.
 
-    A second port, the CDN, receives and serves large files by SHA-256. Requests to the CDN are in the same log, as
-    `/lfs/{sha256}` and `/cdn/{sha256}/{name}`, and the same faults apply.
+    A second server, the CDN, receives and serves large files by SHA-256. Its requests are in the same log, with the
+    paths `/lfs/{sha256}` and `/cdn/{sha256}/{name}`, and the same faults apply.
 
     Args:
         root: empty folder for contents and for the client's caches.
@@ -70,9 +70,9 @@ class Hub(HubState):
                 try:
                     with self._lock:
                         return route(HubRequest(self, request, names, body))
-                except Refusal as refusal:
-                    return refusal.answer
-        return Refusal(404, "Sorry, we can't find the page you are looking for.").answer
+                except HubError as error:
+                    return error.answer
+        return HubError(404, "Sorry, we can't find the page you are looking for.").answer
 
     def _serve_blob(self, request: Request, body: bytes) -> Answer:
         sha256 = request.path.split("/")[2]

@@ -17,8 +17,8 @@ LFS_SUFFIXES += (".xz", ".zip", ".zst")
 LFS_BYTES = 10 << 20  # files of at least this size are stored by LFS, whatever their suffix
 
 
-class Refusal(Exception):
-    """An error with which the test Hub answers a request.
+class HubError(Exception):
+    """Error that makes the test Hub answer a request with an error status.
 
     Args:
         status: HTTP status of the answer.
@@ -71,7 +71,7 @@ class Commit:
 
 @dataclass
 class Repo:
-    """A dataset repository. Every commit stays readable by its hash."""
+    """A dataset repository, whose commits can be read by branch, tag or hash."""
 
     id: str
     private: bool = False
@@ -80,10 +80,10 @@ class Repo:
     commits: dict[str, Commit] = field(default_factory=dict)
 
     def resolve(self, revision: str) -> Commit:
-        """Return the commit of a branch, a tag, or a commit's hash."""
+        """Return the commit that a revision names: a branch, a tag, or the hash of a commit."""
         commit = self.commits.get(self.branches.get(revision) or self.tags.get(revision) or revision)
         if commit is None:
-            raise Refusal(404, f"Invalid rev id: {revision}", "RevisionNotFound")
+            raise HubError(404, f"Invalid rev id: {revision}", "RevisionNotFound")
         return commit
 
     def commit(self, branch: str, files: Mapping[str, File]) -> Commit:
@@ -105,18 +105,18 @@ class Blobs:
         root.mkdir(parents=True)
 
     def path(self, sha256: str) -> Path:
-        """Return the path at which content with a SHA-256 is stored; the file may not exist."""
+        """Return the path of the content with a given SHA-256; the file exists only if the content is stored."""
         return self._root / sha256
 
     def add(self, data: bytes, lfs: bool) -> File:
-        """Store the content of a file."""
+        """Store the content of a file, and return the record of the file that a commit contains."""
         sha256 = hashlib.sha256(data).hexdigest()
         if not self.path(sha256).exists():  # do not overwrite a file that a client may be downloading
             self.path(sha256).write_bytes(data)
         return self.file(sha256, lfs)
 
     def file(self, sha256: str, lfs: bool) -> File:
-        """Return the commit's description of a file with stored content."""
+        """Return the record of a stored file that a commit contains."""
         size = self.path(sha256).stat().st_size
         in_git = _pointer(sha256, size) if lfs else self.path(sha256).read_bytes()
         return File(sha256, size, hashlib.sha1(b"blob %d\0" % len(in_git) + in_git).hexdigest(), lfs)
@@ -148,5 +148,5 @@ class HubState:
     def repo(self, id: str) -> Repo:
         """Return the repository with the id <org>/<repo>."""
         if id not in self.repos:
-            raise Refusal(404, "Repository not found", "RepoNotFound")
+            raise HubError(404, "Repository not found", "RepoNotFound")
         return self.repos[id]

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from tests.servers.faults import Request
 from tests.servers.http import Answer
-from tests.servers.hub_repos import LFS_SUFFIXES, File, HubState, Refusal, Repo, is_large
+from tests.servers.hub_repos import LFS_SUFFIXES, File, HubError, HubState, Repo, is_large
 
 REPO = r"/api/datasets/(?P<id>[^/]+/[^/]+)"
 AT = r"/(?P<revision>[^/]+)"
@@ -38,7 +38,7 @@ class HubRequest:
         """The repository named in the path; requests without the token do not find private repositories."""
         repo = self.hub.repo(self.names["id"])
         if repo.private and not self.authorized:
-            raise Refusal(401, "Repository not found", "RepoNotFound")
+            raise HubError(401, "Repository not found", "RepoNotFound")
         return repo
 
     @property
@@ -50,40 +50,40 @@ class HubRequest:
 
     def require_token(self) -> None:
         if not self.authorized:
-            raise Refusal(401, "Invalid username or password.")
+            raise HubError(401, "Invalid username or password.")
 
 
 Route = Callable[[HubRequest], Answer]
 
 
-def answer(data: Any, status: int = 200, **headers: str) -> Answer:
+def json_answer(data: Any, status: int = 200, **headers: str) -> Answer:
     return Answer(json.dumps(data).encode(), status, {"Content-Type": "application/json", **headers})
 
 
-def info(call: HubRequest) -> Answer:
+def repo_info(call: HubRequest) -> Answer:
     repo = call.repo
     commit = repo.resolve(call.names.get("revision", "main"))
     data = {"_id": "0" * 24, "id": repo.id, "author": repo.id.split("/")[0], "sha": commit.oid, "gated": False}
     data |= {"lastModified": commit.date, "private": repo.private, "disabled": False, "downloads": 0, "likes": 0}
     siblings = [{"rfilename": path, "size": file.size} for path, file in commit.files.items()]
-    return answer(data | {"tags": [], "siblings": siblings})
+    return json_answer(data | {"tags": [], "siblings": siblings})
 
 
-def tree(call: HubRequest) -> Answer:
+def list_files(call: HubRequest) -> Answer:
     """Answer with all files and folders, at all depths."""
     files = call.repo.resolve(call.names["revision"]).files
     parents = {str(parent) for path in files for parent in PurePosixPath(path).parents} - {"."}
     folders = [{"type": "directory", "oid": "0" * 40, "size": 0, "path": parent} for parent in sorted(parents)]
-    return answer([*folders, *(file.entry(path) for path, file in files.items())])
+    return json_answer([*folders, *(file.entry(path) for path, file in files.items())])
 
 
-def refs(call: HubRequest) -> Answer:
-    def listed(folder: str, names: dict[str, str]) -> list[dict]:
+def list_refs(call: HubRequest) -> Answer:
+    def named_refs(folder: str, names: dict[str, str]) -> list[dict]:
         return [{"name": name, "ref": f"refs/{folder}/{name}", "targetCommit": oid} for name, oid in names.items()]
 
     repo = call.repo
-    data = {"branches": listed("heads", repo.branches), "tags": listed("tags", repo.tags), "converts": []}
-    return answer(data | {"pullRequests": []})
+    data = {"branches": named_refs("heads", repo.branches), "tags": named_refs("tags", repo.tags), "converts": []}
+    return json_answer(data | {"pullRequests": []})
 
 
 def resolve(call: HubRequest) -> Answer:
@@ -91,7 +91,7 @@ def resolve(call: HubRequest) -> Answer:
     commit, path = call.repo.resolve(call.names["revision"]), call.names["path"]
     headers = {"X-Repo-Commit": commit.oid}
     if path not in commit.files:
-        raise Refusal(404, "Entry not found", "EntryNotFound", headers)
+        raise HubError(404, "Entry not found", "EntryNotFound", headers)
     file = commit.files[path]
     if not file.lfs:
         return Answer(call.hub.blobs.path(file.sha256), headers=headers | {"ETag": f'"{file.oid}"'})
@@ -104,22 +104,22 @@ def resolve(call: HubRequest) -> Answer:
     return Answer(b"Found. Redirecting\n", 302, headers)
 
 
-def create(call: HubRequest) -> Answer:
+def create_repo(call: HubRequest) -> Answer:
     call.require_token()
     wanted = call.json()
     id = f"{wanted['organization']}/{wanted['name']}"
     url = f"{call.hub.endpoint}/datasets/{id}"
     if id in call.hub.repos:
-        return answer({"error": "You already created this dataset repo", "url": url}, 409)
+        return json_answer({"error": "You already created this dataset repo", "url": url}, 409)
     repo = Repo(id, bool(wanted.get("private")) or wanted.get("visibility") == "private")
     attributes = "".join(f"*{suffix} filter=lfs diff=lfs merge=lfs -text\n" for suffix in sorted(LFS_SUFFIXES))
     repo.commit("main", {".gitattributes": call.hub.blobs.add(attributes.encode(), lfs=False)})
     call.hub.repos[id] = repo
-    return answer({"url": url, "name": id, "id": repo.id})
+    return json_answer({"url": url, "name": id, "id": repo.id})
 
 
 def preupload(call: HubRequest) -> Answer:
-    """Answer for each announced file whether to upload it by LFS, and with the hash of the existing file."""
+    """Answer which of the announced files to upload by LFS, and with the hashes of files that already exist."""
     call.require_token()
     commit, listed = call.repo.resolve(call.names["revision"]), []
     for announced in call.json()["files"]:
@@ -130,11 +130,11 @@ def preupload(call: HubRequest) -> Answer:
             known = commit.files[path]
             file["oid"] = known.sha256 if known.lfs else known.oid
         listed.append(file)
-    return answer({"files": listed, "commitOid": commit.oid})
+    return json_answer({"files": listed, "commitOid": commit.oid})
 
 
 def lfs_batch(call: HubRequest) -> Answer:
-    """Answer with upload addresses for those large files whose content the CDN does not have."""
+    """Answer with upload addresses for the large files that the CDN does not store yet."""
     call.require_token()
     objects = []
     for announced in call.json()["objects"]:
@@ -142,7 +142,7 @@ def lfs_batch(call: HubRequest) -> Answer:
         if not call.hub.blobs.path(announced["oid"]).exists():
             entry["actions"] = {"upload": {"href": f"{call.hub.cdn}/lfs/{announced['oid']}"}}
         objects.append(entry)
-    return answer({"transfer": "basic", "objects": objects})
+    return json_answer({"transfer": "basic", "objects": objects})
 
 
 def commit(call: HubRequest) -> Answer:
@@ -154,11 +154,11 @@ def commit(call: HubRequest) -> Answer:
         operation = json.loads(line)
         if operation["key"] == "header":
             if not head.oid.startswith(operation["value"].get("parentCommit") or ""):
-                raise Refusal(412, "A commit has happened since. Please refresh and try again.")
+                raise HubError(412, "A commit has happened since. Please refresh and try again.")
         else:
             _apply(call.hub, files, operation["key"], operation["value"])
     oid = repo.commit(branch, files).oid
-    return answer({"success": True, "commitOid": oid, "commitUrl": f"{call.url}/commit/{oid}", "hookOutput": ""})
+    return json_answer({"success": True, "commitOid": oid, "commitUrl": f"{call.url}/commit/{oid}", "hookOutput": ""})
 
 
 def _apply(hub: HubState, files: dict[str, File], key: str, value: dict) -> None:
@@ -168,7 +168,7 @@ def _apply(hub: HubState, files: dict[str, File], key: str, value: dict) -> None
         content = base64.b64decode(value["content"], validate=True)
         files[path] = hub.blobs.add(content, lfs=False)
     elif key == "lfsFile":
-        files[path] = hub.blobs.file(value["oid"], lfs=True)  # an error if the content was not uploaded
+        files[path] = hub.blobs.file(value["oid"], lfs=True)  # raises an error if the content was not uploaded
     else:
         del files[path]
 
@@ -177,23 +177,23 @@ def new_tag(call: HubRequest) -> Answer:
     call.require_token()
     repo, name = call.repo, call.json()["tag"]
     if name in repo.tags:
-        raise Refusal(409, f"Reference already exists: {name}")
+        raise HubError(409, f"Reference already exists: {name}")
     repo.tags[name] = repo.resolve(call.names["revision"]).oid
-    return answer({})
+    return json_answer({})
 
 
 def validate_yaml(call: HubRequest) -> Answer:
-    """Answer as the Hub does to a valid dataset card, without checking the card."""
-    return answer({"errors": [], "warnings": []})
+    """Accept every dataset card with the Hub's answer for valid cards."""
+    return json_answer({"errors": [], "warnings": []})
 
 
 ROUTES: list[tuple[str, str, Route]] = [
     ("POST", "/api/validate-yaml", validate_yaml),
-    ("POST", "/api/repos/create", create),
-    ("GET", REPO, info),
-    ("GET", f"{REPO}/revision{AT}", info),
-    ("GET", f"{REPO}/tree{AT}/?", tree),
-    ("GET", f"{REPO}/refs", refs),
+    ("POST", "/api/repos/create", create_repo),
+    ("GET", REPO, repo_info),
+    ("GET", f"{REPO}/revision{AT}", repo_info),
+    ("GET", f"{REPO}/tree{AT}/?", list_files),
+    ("GET", f"{REPO}/refs", list_refs),
     ("POST", f"{REPO}/preupload{AT}", preupload),
     ("POST", f"{REPO}/commit{AT}", commit),
     ("POST", f"{REPO}/tag{AT}", new_tag),

@@ -51,10 +51,13 @@ REMOVED += ("HF_OIDC_RESOURCE", "HF_HUB_DISABLE_IMPLICIT_TOKEN", "HUGGINGFACE_CO
 
 @contextmanager
 def hub_settings(variables: Mapping[str, str]) -> Iterator[None]:
-    """Apply `hub_environment` to a process that has already imported huggingface_hub.
+    """Direct this process, which has already imported huggingface_hub, to the test Hub within a context.
 
-    This replaces the client's constants in every module that has copied them, and the endpoint of the API object that
-    the client makes on import. The client's HTTP session is closed before and after.
+    The context replaces the client's constants in every module that has copied them, and the endpoint of the API object
+    that the client makes on import. The client's HTTP session is closed at the start and at the end.
+
+    Args:
+        variables: environment variables from `hub_environment`.
     """
     changes, before = _changed_constants(variables), constants.ENDPOINT
     with environment_variables({**variables, **dict.fromkeys(REMOVED)}):
@@ -68,7 +71,7 @@ def hub_settings(variables: Mapping[str, str]) -> Iterator[None]:
 
 
 def _changed_constants(variables: Mapping[str, str]) -> dict[str, tuple[Any, Any]]:
-    """Return the old and the new value of each constant of huggingface_hub to change, by name."""
+    """Return the constants of huggingface_hub that must change, as name -> (old value, new value)."""
     endpoint, home = variables["HF_ENDPOINT"], variables["HF_HOME"]
     values = {
         "ENDPOINT": endpoint,

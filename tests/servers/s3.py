@@ -16,7 +16,7 @@ from tests.servers.process import environment_variables
 
 @contextmanager
 def s3_server(folder: Path, bucket: str = "data") -> Iterator[str]:
-    """Serve the files of a folder from an S3 bucket, which fsspec finds without options; yield the bucket's address."""
+    """Serve the files of a folder from an S3 bucket; yield the bucket's address, which fsspec opens without options."""
     logging.getLogger("werkzeug").setLevel(logging.ERROR)  # moto logs every request
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()

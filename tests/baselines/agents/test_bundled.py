@@ -29,7 +29,7 @@ OPTIONS = TrainOptions(steps=1, batch_size=2, context=6)
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
+def trained_run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("bundled") / "run"
     histories = HistoryOptions(("demo_wide",), source=("noise",), channels="canonical", labels="oracle")
     job = prepare("ad", MODEL, OPTIONS, histories)
@@ -38,60 +38,63 @@ def run(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def models(run, tmp_path, monkeypatch) -> Path:
-    """Replace the package's bundled models by a folder with one model of one track."""
-    bundle_run(run, "ad-tiny", "teammate", tmp_path)
+def models(trained_run, tmp_path, monkeypatch) -> Path:
+    """Replace the package's bundled models with one small model for the track `teammate`."""
+    bundle_run(trained_run, "ad-tiny", "teammate", tmp_path)
     monkeypatch.setattr(bundled.bundled_models, "__defaults__", (tmp_path,))
     return tmp_path
 
 
-def test_bundled_model_has_name_parameters_and_training_record_of_the_run(run, models):
+def test_bundled_model_keeps_parameters_and_training_record_of_its_run(trained_run, models):
     agent = find_agent("ad-tiny")
     assert agent.details and agent.name == agent.details["model"] == "ad-tiny"
-    assert agent.details["trained_on"] == {"teammate": read_trained(run).trained_on}
+    assert agent.details["trained_on"] == {"teammate": read_trained(trained_run).trained_on}
     message = "ad-tiny: no model for layout cramped_down of track layout, only for tracks teammate: choose tasks"
     with pytest.raises(OptionError, match=message):
         agent.make(get_layout("cramped_down"))
-    one, two = read_trained(run), read_trained(models / "ad-tiny" / "teammate")
+    one, two = read_trained(trained_run), read_trained(models / "ad-tiny" / "teammate")
     jax.tree.map(np.testing.assert_array_equal, one.params, two.params)
     assert (one.step, one.context, one.layouts, one.trained_on) == (two.step, two.context, two.layouts, two.trained_on)
     text = (models / "ad-tiny" / "teammate" / "config.json").read_text(encoding="utf-8")
     assert json.loads(text)["histories"]["root"] == "mini" and str(Path.home()) not in text
-    with Image.open(run / "curves.png") as drawn, Image.open(models / "ad-tiny" / "teammate" / "curves.png") as copied:
+    with (
+        Image.open(trained_run / "curves.png") as drawn,
+        Image.open(models / "ad-tiny" / "teammate" / "curves.png") as copied,
+    ):
         assert copied.size == drawn.size and copied.mode == "P"
 
 
-def test_model_bundled_with_sampled_actions_draws_actions_by_default(run, tmp_path, monkeypatch):
-    bundle_run(run, "ad-drawn", "teammate", tmp_path, sampled=True)
+def test_model_bundled_as_sampled_samples_its_actions_by_default(trained_run, tmp_path, monkeypatch):
+    bundle_run(trained_run, "ad-drawn", "teammate", tmp_path, sampled=True)
     monkeypatch.setattr(bundled.bundled_models, "__defaults__", (tmp_path,))
     by_default, greedy = find_agent("ad-drawn"), find_agent("ad-drawn", greedy=True)
     assert by_default.name == "ad-drawn" and by_default.details and by_default.details["sampled"] is True
     assert greedy.name == "ad-drawn (greedy)" and greedy.details and "sampled" not in greedy.details
     assert find_ego("--agent", "ad-drawn", acting="exact", greedy=None).name == "ad-drawn"
     assert find_ego("--agent", "ad-drawn", greedy=True).name == "ad-drawn (greedy)"
-    assert find_ego("--agent", str(run), greedy=False).name == "AD+mlp (sampled)"
+    assert find_ego("--agent", str(trained_run), greedy=False).name == "AD+mlp (sampled)"
     assert run_cli("models").endswith("(source noise), draws its actions\n")
     with pytest.raises(UnknownNameError, match=r"unknown acting 'exat'.*Did you mean 'exact'"):
-        find_agent(run, acting="exat")  # type: ignore[arg-type]
+        find_agent(trained_run, acting="exat")  # type: ignore[arg-type]
 
 
-def test_bundling_rejects_invalid_names_unfinished_runs_and_large_models(run, tmp_path, monkeypatch):
+def test_bundling_rejects_invalid_names_unfinished_runs_and_large_models(trained_run, tmp_path, monkeypatch):
     for name in ("../ad", "oracle", "AD-x", ""):
         with pytest.raises(OptionError, match="expected words of small letters and digits with hyphens: ad-reference"):
-            bundle_run(run, name, "teammate", tmp_path)
-    config = json.loads((run / "config.json").read_text())
+            bundle_run(trained_run, name, "teammate", tmp_path)
+    config = json.loads((trained_run / "config.json").read_text())
     half = tmp_path / "half"
-    shutil.copytree(run, half)
+    shutil.copytree(trained_run, half)
     (half / "config.json").write_text(json.dumps(config | {"train": config["train"] | {"steps": 9}}))
     with pytest.raises(OptionError, match="half: stopped at step 1 of 9; resume training with the same command"):
         bundle_run(half, "ad-tiny", "teammate", tmp_path / "models")
     monkeypatch.setattr(bundled, "_LARGEST", 1000)
     with pytest.raises(OptionError, match=r"parameters of [\d,]+ bytes, expected at most 1,000: bundle a smaller"):
-        bundle_run(run, "ad-tiny", "teammate", tmp_path / "models")
+        bundle_run(trained_run, "ad-tiny", "teammate", tmp_path / "models")
     assert not (tmp_path / "models").exists()
 
 
-def test_models_of_the_package_are_small_have_cards_and_load():
+def test_models_in_the_package_are_small_and_loadable_and_have_cards():
     assert set(bundled_models(MODELS)) == {"ad-reference", "ad-rising", "dpt-reference", "rl2-reference"}
     scores = describe_scores(read_stored(results_file()), bundled_models(MODELS))
     for model in bundled_models(MODELS).values():
@@ -106,9 +109,10 @@ def test_models_of_the_package_are_small_have_cards_and_load():
                 assert agent.make(get_layout(layout)).sees == "canonical_input"
 
 
-def test_training_rejects_initial_parameters_of_another_model_size(run, tmp_path):
+def test_training_rejects_initial_parameters_of_another_model_size(trained_run, tmp_path):
     out = str(tmp_path / "out")
-    arguments = ["train", "ad", "--layout", "demo_wide", "--channels", "canonical", "--out", out, "--init", str(run)]
+    words = ["train", "ad", "--layout", "demo_wide", "--channels", "canonical"]
+    arguments = [*words, "--out", out, "--init", str(trained_run)]
     small = ["--steps", "1", "--batch-size", "2", "--context", "6", "--heads", "2", "--dropout", "0.1"]
     with pytest.raises(OptionError, match=r"its parameters are of another model \(width = 8, not 12\); give these"):
         run_cli(*arguments, *small, "--layers", "1", "--width", "12", "--positions", "none")

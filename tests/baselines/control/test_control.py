@@ -14,17 +14,19 @@ from tests.helpers.commands import run_cli
 TINY = control.ControlSize(bandit_steps=4, room_episodes=2, rows=64, tasks=4, updates=(2, 2, 2), batch_size=4)
 
 
-def always(action: int) -> Policy:
+def constant_policy(action: int) -> Policy:
     return Policy((), lambda params, key: (), lambda params, carry, view, key: (jnp.int32(action), carry), "ego_input")
 
 
 def test_bandit_and_dark_room_give_expected_rewards():
     means = jnp.array([[0.0, 1.0, 0, 0, 0], [1.0, 0.0, 0, 0, 0]])
-    actions, rewards = worlds.play_world(worlds.bandit(), always(1), means, 0, 6)
+    actions, rewards = worlds.play_world(worlds.bandit(), constant_policy(1), means, 0, 6)
     assert actions.tolist() == [[1] * 6] * 2
     assert rewards.tolist() == [[1] * 6, [0] * 6]
     above, corner = worlds.MIDDLE - worlds.SIDE, 0
-    _, rewards = worlds.play_world(worlds.dark_room(), always(0), jnp.array([above, corner]), 0, 2 * worlds.ROOM_STEPS)
+    _, rewards = worlds.play_world(
+        worlds.dark_room(), constant_policy(0), jnp.array([above, corner]), 0, 2 * worlds.ROOM_STEPS
+    )
     episode = [1] + [0] * (worlds.ROOM_STEPS - 1)  # the agent moves up past the goal to the wall
     assert rewards.tolist() == [episode * 2, [0] * 2 * worlds.ROOM_STEPS]
     assert worlds.best_return(np.array([above, corner])).tolist() == [10, 7]
@@ -55,12 +57,12 @@ def test_control_command_exits_with_1_if_a_check_fails(tmp_path, monkeypatch, qu
 
 
 @pytest.mark.slow
-def test_tiny_control_trains_all_models_and_fails_checks(tmp_path, monkeypatch):
+def test_control_trains_all_models_and_fails_if_they_are_undertrained(tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "can_draw", lambda: False)
     monkeypatch.setattr(control.run_control, "__defaults__", (TINY, lambda name, total, step, loss: None))
     printed = run_cli("control", "--out", tmp_path, code=1)
     assert printed.count("FAIL") >= 2
-    # Four steps are too few for a model without context to have twice the regret of the source algorithm.
+    # In only four steps, a model without context cannot have twice the regret of the source algorithm.
     assert "FAIL  bandits    AD, context cut off" in printed
     parts = {path.name for path in tmp_path.iterdir() if path.is_dir()}
     assert parts == {"dpt_on_bandits", "ad_on_bandits", "ad_in_dark_room"}

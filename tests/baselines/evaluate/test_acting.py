@@ -54,28 +54,28 @@ def test_evaluation_of_a_trained_model_stores_settings_of_its_run(runs, tmp_path
         evaluate(agent.name, agent.make, WIDE[:1], SHORT, details={"step": 3}, out=tmp_path)
 
 
-class TestBadRuns:
+class TestInvalidRuns:
     def test_evaluation_on_layout_of_another_shape_raises_error(self, runs, tmp_path):
         arguments = ["evaluate", "--agent", str(runs / "ad"), "--layout", "coord_simple", "--out", str(tmp_path)]
         with pytest.raises(OptionError, match=r"trained on demo_wide with observations \(5, 5, 45\); coord_simple has"):
             run_cli(*arguments)
 
     def test_damaged_or_incompatible_run_raises_error(self, runs, tmp_path):
-        def copy(name: str, **changes) -> str:
+        def copied_run(name: str, **changes) -> str:
             shutil.copytree(runs / "ad", tmp_path / name)
             config = json.loads((tmp_path / name / "config.json").read_text())
             (tmp_path / name / "config.json").write_text(json.dumps(config | changes))
             return str(tmp_path / name)
 
         with pytest.raises(OptionError, match=r"run_format 99, but version \S+ .* reads run_format 4 only: .*--out\)$"):
-            find_agent(copy("newer", run_format=99))
+            find_agent(copied_run("newer", run_format=99))
         with pytest.raises(OptionError, match=r"use this run with version 9\.9 of this package, which wrote it$"):
-            find_agent(copy("newest", run_format=99, package_version="9.9"))
+            find_agent(copied_run("newest", run_format=99, package_version="9.9"))
         wide = dataclasses.asdict(dataclasses.replace(MODEL, width=32))
         with pytest.raises(OptionError, match=r"not a state of this training: params/.*expected float32 .*, found"):
-            find_agent(copy("wider", model=wide))
+            find_agent(copied_run("wider", model=wide))
         with pytest.raises(OptionError, match="does not describe a run on learning histories: KeyError"):
-            find_agent(copy("other", model={}, histories={}))
-        shutil.rmtree(Path(copy("early")) / "checkpoints")
+            find_agent(copied_run("other", model={}, histories={}))
+        shutil.rmtree(Path(copied_run("early")) / "checkpoints")
         with pytest.raises(OptionError, match="no checkpoint yet; continue the training"):
             find_agent(str(tmp_path / "early"))

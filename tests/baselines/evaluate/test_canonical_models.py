@@ -42,7 +42,7 @@ THIRD = get_layout("cramped_down")
 
 
 @pytest.fixture(scope="module")
-def trained(lite, tmp_path_factory) -> tuple[Path, str]:
+def trained_run(lite, tmp_path_factory) -> tuple[Path, str]:
     """Train on all layouts of a release; return the run folder and the printed output."""
     out = tmp_path_factory.mktemp("canonical") / "run"
     sizes = ["--steps", "1", "--batch-size", "4", "--context", "6", "--layers", "1", "--width", "8", "--heads", "2"]
@@ -51,8 +51,8 @@ def trained(lite, tmp_path_factory) -> tuple[Path, str]:
     return out, printed
 
 
-def test_training_on_all_layouts_uses_canonical_channels(trained):
-    folder, printed = trained
+def test_training_on_all_layouts_uses_canonical_channels(trained_run):
+    folder, printed = trained_run
     summary = "training on coord_simple, demo_wide; canonical channels, observations of 5 x 5 x 46"
     assert summary in printed
     histories = json.loads((folder / "config.json").read_text())["histories"]
@@ -62,8 +62,8 @@ def test_training_on_all_layouts_uses_canonical_channels(trained):
     assert (run.channels, run.obs_shape, run.layouts) == ("canonical", (5, 5, 46), ("coord_simple", "demo_wide"))
 
 
-def test_model_is_evaluated_on_a_layout_without_training_data(trained, tmp_path):
-    folder, _ = trained
+def test_model_is_evaluated_on_a_layout_without_training_data(trained_run, tmp_path):
+    folder, _ = trained_run
     agent = find_agent(str(folder))
     task = published_task(THIRD.name, "H4/t0")
     results = evaluate(agent.name, agent.make, [task], SHORT, details=agent.details, out=tmp_path)
@@ -75,7 +75,7 @@ def test_model_is_evaluated_on_a_layout_without_training_data(trained, tmp_path)
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_jax_egos_receive_canonical_channels_on_every_layout(layout):
-    """Compare observations by a policy that returns its input instead of an action."""
+    """The policy returns its input instead of an action, so the test can compare observations."""
     shown = Policy((), lambda params, key: (), lambda params, memory, ego_input, key: (ego_input, memory), "ego_input")
     (record,), key = random_records(layout, 1, np.random.default_rng(4)), jax.random.split(jax.random.key(0), 1)
     zero = jnp.zeros(1, jnp.int32)
@@ -103,8 +103,8 @@ def test_host_agents_receive_canonical_channels():
         from_host(agent, "union")  # type: ignore[arg-type]
 
 
-def test_training_and_validation_batches_are_rendered_with_correct_layouts(lite):
-    """The validation part contains only the second layout, but its batches use the model's layout numbers."""
+def test_state_records_of_each_batch_are_observed_on_their_own_layouts(lite):
+    """Validation data contains only the second layout, but numbers layouts in the same way as training data."""
     job = prepare("ad", MODEL, dataclasses.replace(OPTIONS, batch_size=8), HistoryOptions(("all",), str(lite[0])))
     names = job.about["histories"]["layouts"]
     view = CompactView("paper", tuple(map(get_layout, names)), canonical=True)
@@ -132,7 +132,7 @@ def test_canonical_channels_are_default_for_several_layouts(lite, layouts, given
     assert (about["channels"], about["obs_shape"]) == (channels, [5, 5, size])
 
 
-def test_layouts_all_selects_every_layout_of_the_release(lite, tmp_path):
+def test_layout_name_all_selects_every_layout_of_the_release(lite, tmp_path):
     random_release(tmp_path, layouts=("asymm_both", "cramped_up"), teammates=1)
     about = prepare("ad", MODEL, OPTIONS, HistoryOptions(("all",), str(tmp_path))).about["histories"]
     assert (about["layouts"], about["channels"]) == (["asymm_both", "cramped_up"], "canonical"), "of one shape, 35"

@@ -1,4 +1,4 @@
-"""Test the memory control, the partner control and the protocol `swap`; the ego acts by its memory."""
+"""Test the memory control, the partner control and the protocol `swap` with an ego that uses its memory."""
 
 from __future__ import annotations
 
@@ -55,38 +55,38 @@ def _act(mode, memory, ego_input, key):
 
 
 def ego(mode):
-    """Return an ego that stays, acts randomly, or, for `PAID`, acts randomly after a first episode without reward."""
+    """Return an ego that stays, acts randomly, or acts randomly only after a first episode without reward."""
     policy = Policy(jnp.int32(mode), _begin, _act, "ego_input")
     return lambda layout: policy
 
 
 @pytest.fixture(scope="module")
-def programs():
-    """Cache of compiled programs that all tests of this module share."""
+def compiled_programs():
+    """Return a cache of compiled programs that all tests of this module share."""
     return Programs()
 
 
 @pytest.fixture(scope="module")
-def solo_returns(programs):
-    """Arrays of returns (tasks, episodes) of the ego that stays and of the ego that acts randomly."""
+def solo_returns(compiled_programs):
+    """Return two arrays of returns (tasks, episodes), for the ego that stays and the ego that acts randomly."""
 
     def play(mode):
-        results = evaluate("fixed", ego(mode), TASKS, FOUR, programs=programs)
+        results = evaluate("fixed", ego(mode), TASKS, FOUR, programs=compiled_programs)
         return np.array([result.returns[0] for result in results])
 
     return play(STAYS), play(RANDOM)
 
 
-def test_memory_and_partner_controls_equal_hand_computed_differences(solo_returns, programs, tmp_path):
+def test_memory_and_partner_controls_equal_hand_computed_differences(solo_returns, compiled_programs, tmp_path):
     stays, wanders = solo_returns
     assert stays.tolist() == [[0] * 4, [40] * 4]
     assert (wanders < stays)[:, 1:].any(axis=1).all()
-    found = evaluate_controls("mine", ego(PAID), TASKS, FOUR, out=tmp_path, programs=programs)
-    assert len(programs) == 2  # evaluation compiles one program for each teammate family
+    found = evaluate_controls("mine", ego(PAID), TASKS, FOUR, out=tmp_path, programs=compiled_programs)
+    assert len(compiled_programs) == 2  # evaluation compiles one program for each teammate family
     plain = np.array([[stays[0, 0], *wanders[0, 1:]], stays[1]])
     np.testing.assert_array_equal([result.returns[0] for result in found.plain], plain)
     np.testing.assert_array_equal([result.returns[0] for result in found.cleared], stays)
-    # After reward with H4, the ego stays with H1; after no reward with H1, the ego acts randomly with H4.
+    # An ego that earned reward with H4 stays still with H1; an ego without reward from H1 moves randomly with H4.
     swapped = np.array([result.returns[0] for result in found.swapped])
     np.testing.assert_array_equal(swapped[:, 2:], [stays[0, 2:], wanders[1, 2:]])
     np.testing.assert_array_equal(found.memory[:, 0], (plain - stays).mean(axis=1))
@@ -102,7 +102,7 @@ def test_memory_and_partner_controls_equal_hand_computed_differences(solo_return
 
 
 def test_control_intervals_treat_equal_behaviours_as_one_unit():
-    """With one seed, five H4 teammates of equal behaviour give no interval; the different H3 teammates give one."""
+    """With one seed, five H4 teammates of equal behaviour give no interval; five different H3 teammates do."""
     tasks = [task for task in published_tasks("teammate") if task.layout.name == "coord_simple"]
     values = np.arange(4.0)
     for family in ("H4", "H3"):
@@ -115,18 +115,18 @@ def test_control_intervals_treat_equal_behaviours_as_one_unit():
         assert memory.startswith("track teammate, benefit M of memory: +2.0") and ("(" in memory) == (family == "H3")
 
 
-def test_controls_do_not_change_returns_of_ego_without_memory(solo_returns, programs):
+def test_controls_do_not_change_returns_of_ego_without_memory(solo_returns, compiled_programs):
     """The random keys of the last episodes do not depend on the teammates of earlier episodes."""
-    found = evaluate_controls("random", ego(RANDOM), TASKS, FOUR, programs=programs)
+    found = evaluate_controls("random", ego(RANDOM), TASKS, FOUR, programs=compiled_programs)
     np.testing.assert_array_equal([result.returns[0] for result in found.plain], solo_returns[1])
     assert not found.memory.any() and not found.partner.any()
     first, swapped = ([result.returns[0][:2] for result in results] for results in (found.plain, found.swapped))
     assert first != swapped
 
 
-def test_protocol_swap_keeps_ego_memory_and_random_keys(solo_returns, programs):
+def test_protocol_swap_keeps_ego_memory_and_random_keys(solo_returns, compiled_programs):
     rules = dataclasses.replace(PROTOCOLS["swap"], episodes=4, swap_every=2)
-    first, second = evaluate("mine", ego(PAID), TASKS, rules, programs=programs)
+    first, second = evaluate("mine", ego(PAID), TASKS, rules, programs=compiled_programs)
     stays, wanders = solo_returns
     assert first.returns[0][:2] == [stays[0, 0], wanders[0, 1]]
     assert second.returns[0] == [40, 40, 0, 0]  # the ego stays, since H4 gave reward in the first episode
@@ -136,14 +136,16 @@ def test_protocol_swap_keeps_ego_memory_and_random_keys(solo_returns, programs):
     assert (first.partners, second.partners) == ([H1.task_id, H4.task_id], [H4.task_id, H1.task_id])
 
 
-def test_stored_control_results_are_reused_only_for_same_partners(programs, tmp_path):
+def test_stored_control_results_are_reused_only_for_same_partners(compiled_programs, tmp_path):
     """An evaluation with a control resumes only with the same partners; results without a control store no partners."""
-    first = evaluate_controls("mine", ego(PAID), TASKS, FOUR, out=tmp_path, details={"of": 1}, programs=programs)
+    first = evaluate_controls(
+        "mine", ego(PAID), TASKS, FOUR, out=tmp_path, details={"of": 1}, programs=compiled_programs
+    )
 
-    def forbidden(layout):
+    def forbidden_ego(layout):
         raise AssertionError("finished tasks are evaluated again")
 
-    assert evaluate_controls("mine", forbidden, TASKS, FOUR, out=tmp_path, details={"of": 1}) == first
+    assert evaluate_controls("mine", forbidden_ego, TASKS, FOUR, out=tmp_path, details={"of": 1}) == first
     plain, cleared, swapped = (results[0].settings for results in first[:3])
     rules = {"name": "seeded", "noise": "seeded", "four_recipes": False, "episodes": 4, "steps": 100}
     assert plain["protocol"] == rules
@@ -153,7 +155,9 @@ def test_stored_control_results_are_reused_only_for_same_partners(programs, tmp_
     assert "partners" not in first.plain[0].to_json()
     message = f"holds a result with the teammates of {H1.task_id}, {H4.task_id}, expected those of {H2.task_id}, "
     with pytest.raises(OptionError, match=message):
-        evaluate("mine", forbidden, [H4, H2, H1], FOUR, control="swapped", out=tmp_path / "swapped", details={"of": 1})
+        evaluate(
+            "mine", forbidden_ego, [H4, H2, H1], FOUR, control="swapped", out=tmp_path / "swapped", details={"of": 1}
+        )
 
 
 def test_memory_control_resets_host_agents_before_each_episode(tmp_path):
@@ -246,24 +250,24 @@ def test_next_segment_starts_with_its_own_recipes():
     assert not np.array_equal(state.env.record[0], before.env.record[0])
 
 
-def test_evaluate_command_with_controls_writes_all_results(programs, tmp_path, monkeypatch):
+def test_evaluate_command_with_controls_writes_all_results(compiled_programs, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "icrl4aht_baselines.commands.train_commands.find_ego", lambda option, name, **mode: NamedEgo(name, ego(PAID))
     )
-    monkeypatch.setattr("icrl4aht_baselines.evaluate.evaluator.Programs", lambda: programs)
+    monkeypatch.setattr("icrl4aht_baselines.evaluate.evaluator.Programs", lambda: compiled_programs)
     write_tasks(tmp_path / "two.jsonl", TASKS)
 
-    def run(folder, *options, code=0):
+    def run_evaluate(folder, *options, code=0):
         command = ["evaluate", "--agent", "mine", "--manifest", tmp_path / "two.jsonl", *options]
         return run_cli(*command, "--out", tmp_path / folder, code=code)
 
-    printed = run("run", "--episodes", "4", "--controls")
+    printed = run_evaluate("run", "--episodes", "4", "--controls")
     assert (
         "track teammate, benefit M of memory: " in printed
         and "track teammate, benefit P of the right context: " in printed
     )
     for folder in ("run", "run/cleared", "run/swapped"):
         assert len(list((tmp_path / folder / "tasks").glob("*.json"))) == 2
-    assert "--controls: cannot be used with --forget" in run("run", "--controls", "--forget", code=2)
-    run("cleared", "--episodes", "4", "--forget")
+    assert "--controls: cannot be used with --forget" in run_evaluate("run", "--controls", "--forget", code=2)
+    run_evaluate("cleared", "--episodes", "4", "--forget")
     assert read_run(tmp_path / "cleared").table.equals(read_run(tmp_path / "run/cleared").table)

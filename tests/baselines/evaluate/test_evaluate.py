@@ -38,20 +38,20 @@ H4 = [task for task in ALL if task.teammate_family == "H4"]
 SIMPLE, RING = ([task for task in H4 if task.layout.name == name] for name in ("coord_simple", "coord_ring"))
 
 
-def returns(results):
+def returns_by_task(results):
     return {result.task_id: result.returns for result in results}
 
 
 @pytest.fixture(scope="module")
 def batch_returns():
-    """Returns of ten tasks that were evaluated in one batch."""
-    return returns(evaluate("random", random, SIMPLE + RING, PUBLISHED))
+    """Return the returns of ten tasks that are evaluated in one batch."""
+    return returns_by_task(evaluate("random", random, SIMPLE + RING, PUBLISHED))
 
 
 def test_returns_of_a_task_do_not_depend_on_other_tasks_in_batch(batch_returns):
-    alone = returns(evaluate("random", random, [RING[3]], PUBLISHED))
+    alone = returns_by_task(evaluate("random", random, [RING[3]], PUBLISHED))
     assert alone[RING[3].task_id] == batch_returns[RING[3].task_id]
-    assert returns(evaluate("random", random, RING[::-1], PUBLISHED)) == {
+    assert returns_by_task(evaluate("random", random, RING[::-1], PUBLISHED)) == {
         task.task_id: batch_returns[task.task_id] for task in RING
     }
 
@@ -60,12 +60,12 @@ def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_retu
     first = evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
     started, played = [], []
 
-    def watched(layout):
+    def make_recorded_ego(layout):
         started.append(layout.name)
         return random(layout)
 
-    again = evaluate("random", watched, SIMPLE + RING, PUBLISHED, out=tmp_path, played=played.append)
-    assert returns(again) == batch_returns
+    again = evaluate("random", make_recorded_ego, SIMPLE + RING, PUBLISHED, out=tmp_path, played=played.append)
+    assert returns_by_task(again) == batch_returns
     assert played == [5 * 4, 5, 5, 5, 5]  # stored tasks are reported in one call, other tasks after each episode
     assert started == ["coord_ring"]
     assert len(list((tmp_path / "tasks").iterdir())) == 10
@@ -84,7 +84,7 @@ def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_retu
 
 def test_seeds_and_tasks_give_different_returns(batch_returns):
     """Seeds that are evaluated in one batch do not affect each other."""
-    both = returns(evaluate("random", random, SIMPLE, PUBLISHED, seeds=[7, 0]))
+    both = returns_by_task(evaluate("random", random, SIMPLE, PUBLISHED, seeds=[7, 0]))
     assert all(both[task.task_id][1:] == batch_returns[task.task_id] for task in SIMPLE)
     assert any(both[task.task_id][0] != batch_returns[task.task_id][0] for task in SIMPLE)
     assert len({tuple(batch_returns[task.task_id][0]) for task in SIMPLE}) > 1
@@ -192,7 +192,7 @@ def test_tasks_per_family_and_episodes_can_be_limited():
         get_protocol("seeded", 0)
 
 
-def test_note_names_layouts_that_hide_the_recipe_from_the_ego():
+def test_hidden_recipe_note_lists_layouts_that_hide_the_recipe():
     simple, right = ([task for task in ALL if task.layout.name == name] for name in ("demo_simple", "asymm_right"))
     assert hidden_recipe_note(simple) == ""
     note = hidden_recipe_note([*simple, *right])

@@ -32,7 +32,8 @@ def suite(tmp_path) -> Path:
     root, layout = tmp_path / "suite", get_layout("cramped_up")
     network, where = ActorCritic(Widths((4,), (4,), 8, 8, 8)), "cramped_up/fcp/m0/c0"
     shapes = jax.eval_shape(lambda: network.untrained(jax.random.key(0), layout.channels))
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # initialization would be slow
+    # Random initialization would be slow.
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     save_policy(root / where, network, zeros, {"seed": 0})
     entry = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0}
     entry["theta"] = {"checkpoint": where, "sha256": file_hash(root / where / POLICY_WEIGHTS)}

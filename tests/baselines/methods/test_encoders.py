@@ -37,7 +37,7 @@ def make_method(kind: Any, view: Any = None) -> Method:
     )
 
 
-def batch_of(root: Path, obs: Any) -> Any:
+def load_batch(root: Path, obs: Any) -> Any:
     dataset = load_icrl4aht(root, layout="demo_wide", obs=obs)
     return dataset.ad(length=9, batch_size=3, teammate_actions=True)[2]
 
@@ -49,13 +49,13 @@ def loss_and_gradient(method: Method, params: Any, batch: Any) -> Any:
 def test_words_encoder_has_the_loss_and_gradient_of_the_paper_encoder(lite):
     """The paper's encoder receives observations; the encoder `words` receives state records.
 
-    Gradients agree relative to each parameter's largest entry.
+    The tolerance of each parameter's gradient is relative to the largest entry of this gradient.
     """
     paper, words = make_method("paper", plain_view), make_method("words")
     params = random_parameters(paper)
     jax.tree.map(np.testing.assert_array_equal, params, random_parameters(words))
-    (loss, log), gradient = loss_and_gradient(words, params, batch_of(lite[0], "state"))
-    (expected_loss, expected_log), expected = loss_and_gradient(paper, params, batch_of(lite[0], "uint8"))
+    (loss, log), gradient = loss_and_gradient(words, params, load_batch(lite[0], "state"))
+    (expected_loss, expected_log), expected = loss_and_gradient(paper, params, load_batch(lite[0], "uint8"))
     assert 0 < log["distinct_observations"] < 1
     np.testing.assert_allclose(loss, expected_loss, rtol=1e-5)
     for number in log.keys() & expected_log.keys():
@@ -80,7 +80,7 @@ def test_equal_observations_are_grouped_unless_hashes_collide(monkeypatch, colli
 
 @pytest.mark.parametrize("canonical", [False, True])
 @pytest.mark.parametrize("kind", ["paper", "words", "mlp"])
-def test_views_of_states_on_several_layouts_equal_the_observations(two_layouts, kind, canonical):
+def test_observations_computed_from_states_equal_stored_observations(two_layouts, kind, canonical):
     layouts = tuple(get_layout(name) for name in ("asymm_both", "cramped_up"))
     view = CompactView(kind, layouts, canonical=canonical)
     channels = "canonical" if canonical else "own"

@@ -28,18 +28,18 @@ STEPS = ("ad", "hybrid_ad", pytest.param("amago_offline", marks=pytest.mark.slow
 
 
 @cache
-def tiny(name: str, **changes: Any) -> tuple[Method, Any]:
-    """Return a method for flat observations, and random parameters."""
+def tiny_method(name: str, **changes: Any) -> tuple[Method, Any]:
+    """Return a small method for flat observations, and random parameters for its model."""
     method = get_method(name)(dataclasses.replace(TINY, **changes), FLAT)
     return method, random_parameters(method)
 
 
-def run(method: Method, params: Any, *inputs: Any, **named: Any) -> Any:
+def apply_model(method: Method, params: Any, *inputs: Any, **named: Any) -> Any:
     """Apply the model of a method to inputs and return the output."""
     return method.model.apply({"params": params}, *inputs, **named)
 
 
-class TestSizes:
+class TestModelOptions:
     @pytest.mark.parametrize(("name", "parameters"), [("ad", 3_283_870), ("dpt", 3_285_022), ("hybrid_ad", 913_310)])
     def test_default_models_have_the_published_parameter_counts(self, name, parameters):
         method = get_method(name)(ModelOptions(), overcooked_world([get_layout("coord_simple")]))
@@ -57,7 +57,7 @@ class TestSizes:
             get_method("DTP")
 
 
-def dependence(f, *inputs) -> list[np.ndarray]:
+def dependence_masks(f, *inputs) -> list[np.ndarray]:
     """Return a mask (O, T) for each input (T, ..): whether each output (O, ..) of f depends on each input row."""
     jacobians = jax.jit(jax.jacobian(f, argnums=tuple(range(len(inputs)))))(*inputs)
     return [
@@ -76,26 +76,26 @@ KINDS = [
 
 @pytest.mark.parametrize(("name", "positions"), KINDS)
 def test_outputs_depend_only_on_past_and_present_steps(name, positions):
-    method, params = tiny(name, positions=positions)
+    method, params = tiny_method(name, positions=positions)
     steps = batch_steps(ad_batch(rows=1), plain_view)
 
     def policy(obs, rewards):
         changed = steps._replace(obs=obs[None], prev_reward=rewards[None])
-        return method.logits(run(method, params, changed).head)[0]
+        return method.logits(apply_model(method, params, changed).head)[0]
 
-    for found in dependence(policy, steps.obs[0], steps.prev_reward[0]):
+    for found in dependence_masks(policy, steps.obs[0], steps.prev_reward[0]):
         np.testing.assert_array_equal(found, np.tril(np.ones((7, 7), bool)))
 
 
 @pytest.mark.parametrize("name", STEPS)
 def test_policies_depend_on_earlier_actions_of_both_agents(name):
-    method, params = tiny(name)
+    method, params = tiny_method(name)
     steps = batch_steps(ad_batch(rows=1), plain_view)
 
     @jax.jit
     def policy(mine, theirs):
         changed = steps._replace(prev_action=mine, prev_teammate_action=theirs)
-        return method.logits(run(method, params, changed).head)[0]
+        return method.logits(apply_model(method, params, changed).head)[0]
 
     mine, theirs = steps.prev_action, steps.prev_teammate_action
     other = np.arange(7) == 2
@@ -107,14 +107,16 @@ def test_policies_depend_on_earlier_actions_of_both_agents(name):
 
 @pytest.mark.parametrize("positions", [pytest.param("none", marks=pytest.mark.slow), "rope"])
 def test_dpt_outputs_depend_on_the_query_and_context(positions):
-    method, params = tiny("dpt", positions=positions)
+    method, params = tiny_method("dpt", positions=positions)
     batch = dpt_batch(rows=1)
 
-    def answers(obs, rewards, query):
+    def query_logits(obs, rewards, query):
         changed = batch._replace(context_obs=obs[None], context_rewards=rewards[None], query_obs=query)
-        return run(method, params, *batch_transitions(changed, plain_view)).logits[0]
+        return apply_model(method, params, *batch_transitions(changed, plain_view)).logits[0]
 
-    of_obs, of_rewards, of_query = dependence(answers, batch.context_obs[0], batch.context_rewards[0], batch.query_obs)
+    of_obs, of_rewards, of_query = dependence_masks(
+        query_logits, batch.context_obs[0], batch.context_rewards[0], batch.query_obs
+    )
     seen = np.tril(np.ones((7, 6), bool), k=-1)  # output j depends on the first j transitions
     assert seen[-1].all()
     np.testing.assert_array_equal(of_obs, seen)
@@ -122,8 +124,8 @@ def test_dpt_outputs_depend_on_the_query_and_context(positions):
     assert of_query.all()
 
 
-def test_several_dpt_queries_give_outputs_of_single_queries():
-    method, params = tiny("dpt")
+def test_several_dpt_queries_give_the_same_outputs_as_single_queries():
+    method, params = tiny_method("dpt")
     batch = dpt_batch(rows=2)
     other = batch._replace(query_obs=batch.query_obs[::-1], query_target=1 + batch.query_target)
     both = batch._replace(
@@ -133,7 +135,7 @@ def test_several_dpt_queries_give_outputs_of_single_queries():
 
     @jax.jit
     def logits(asked):
-        return run(method, params, *batch_transitions(asked, plain_view)).logits
+        return apply_model(method, params, *batch_transitions(asked, plain_view)).logits
 
     found, first, second = map(logits, (both, batch, other))
     np.testing.assert_allclose(found[:, 0::2], first[:, 0::2], atol=1e-6)
@@ -158,45 +160,49 @@ def test_causal_attention_equals_attention_with_a_mask(monkeypatch):
     """Values and gradients agree to float32 rounding, also if attention is computed in blocks of rows."""
     q, k, v, to = np.random.default_rng(0).normal(size=(4, 2, 15, 2, 8)).astype(np.float32)
 
-    def masked(q, k, v):
+    def masked_attention(q, k, v):
         return jax.nn.dot_product_attention(q, k, v, mask=jnp.asarray(query_mask(7))[None, None])
 
-    def unmasked(q, k, v):
+    def causal_attention_in_parts(q, k, v):
         context = attention.causal_attention(q[:, :7], k[:, :7], v[:, :7])
         queries = attention.causal_attention(q[:, 7:], k[:, :7], v[:, :7], k[:, 7:], v[:, 7:])
         return jnp.concatenate([context, queries], axis=1)
 
-    def results(attend):
+    def value_and_gradients(attend):
         return jax.jit(jax.value_and_grad(lambda *qkv: (attend(*qkv) * to).sum(), argnums=(0, 1, 2)))(q, k, v)
 
-    expected = results(masked)
+    expected = value_and_gradients(masked_attention)
     for short, long in ((attention.SHORT_ROWS, attention.LONG_ROWS), (3, 15), (3, 5)):
         monkeypatch.setattr(attention, "SHORT_ROWS", short)
         monkeypatch.setattr(attention, "LONG_ROWS", long)
-        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-5, atol=5e-6), results(unmasked), expected)
+        jax.tree.map(
+            partial(np.testing.assert_allclose, rtol=2e-5, atol=5e-6),
+            value_and_gradients(causal_attention_in_parts),
+            expected,
+        )
 
 
-def arrays_in(jaxpr: Any) -> Iterator[Any]:
+def intermediate_arrays(jaxpr: Any) -> Iterator[Any]:
     """Yield all intermediate arrays of a computation."""
     for equation in jaxpr.eqns:
         yield from (out.aval for out in equation.outvars)
         for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda leaf: hasattr(leaf, "eqns")):
             if hasattr(inner, "eqns"):
-                yield from arrays_in(inner)
+                yield from intermediate_arrays(inner)
 
 
 @pytest.mark.parametrize("name", ["ad", "dpt"])
 def test_memory_of_long_contexts_is_not_quadratic(name):
-    method, params = tiny(name, layers=1)
+    method, params = tiny_method(name, layers=1)
     batch = ad_batch(rows=1, length=3072) if name == "ad" else dpt_batch(rows=1, context=3072)
     made = jax.make_jaxpr(jax.grad(lambda p: method.loss(p, p, batch, jax.random.key(0))[0]))(params)
-    largest = max(array.size for array in arrays_in(made.jaxpr))
+    largest = max(array.size for array in intermediate_arrays(made.jaxpr))
     assert largest < TINY.heads * 3072 * 1024
 
 
 @pytest.mark.parametrize("name", STEPS)
 def test_padding_does_not_change_the_loss(name):
-    method, params = tiny(name, layers=1)
+    method, params = tiny_method(name, layers=1)
     batch = ad_batch(rows=3)
     lengths = np.array([7, 4, 1])
     mask = np.arange(7) < lengths[:, None]
@@ -216,8 +222,8 @@ def test_padding_does_not_change_the_loss(name):
 
 
 def test_bfloat16_loss_is_close_to_float32_loss():
-    full, params = tiny("ad", layers=1)
-    half, batch = tiny("ad", layers=1, bfloat16=True)[0], ad_batch()
+    full, params = tiny_method("ad", layers=1)
+    half, batch = tiny_method("ad", layers=1, bfloat16=True)[0], ad_batch()
     one, two = (jax.jit(method.loss)(params, params, batch, None)[0] for method in (full, half))
     assert one != two
     np.testing.assert_allclose(one, two, rtol=0.03)
@@ -227,14 +233,14 @@ def test_bfloat16_loss_is_close_to_float32_loss():
 def test_rematerialization_does_not_change_gradients():
     gradients = []
     for remat in (False, True):
-        method, params = tiny("ad", layers=1, remat=remat)
+        method, params = tiny_method("ad", layers=1, remat=remat)
         key = jax.random.key(0)
         gradients.append(jax.jit(jax.grad(lambda p, m=method: m.loss(p, p, ad_batch(), key)[0]))(params))  # noqa: B023
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *gradients)
 
 
 def test_next_observation_loss_uses_taken_actions_within_an_episode():
-    method, params = tiny("ad", layers=1)
+    method, params = tiny_method("ad", layers=1)
     batch = ad_batch()
     log = jax.jit(lambda b: method.loss(params, params, b, None)[1])
 
@@ -267,8 +273,8 @@ def ego_inputs(steps: int, episode: int, seed=0) -> EgoInput:
 
 
 @cache
-def player(name: str, context: int, cached: bool, **changes: Any):
-    method, params = tiny(name, **changes)
+def compiled_player(name: str, context: int, cached: bool, **changes: Any):
+    method, params = tiny_method(name, **changes)
 
     @jax.jit
     def play(seen: EgoInput):
@@ -284,22 +290,22 @@ def player(name: str, context: int, cached: bool, **changes: Any):
 @pytest.mark.parametrize(("name", "positions"), KINDS)
 def test_cached_acting_equals_exact_acting_until_the_window_is_full(name, positions):
     seen = ego_inputs(12, episode=4)
-    exact, cached = (player(name, 12, way, positions=positions)(seen) for way in (False, True))
+    exact, cached = (compiled_player(name, 12, way, positions=positions)(seen) for way in (False, True))
     np.testing.assert_allclose(exact, cached, rtol=1e-4, atol=1e-5)
     assert np.abs(np.diff(exact, axis=0)).min() > 0
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_acting_gives_the_outputs_of_training(name):
-    method, params = tiny(name)
+def test_outputs_while_acting_equal_outputs_in_training(name):
+    method, params = tiny_method(name)
     seen = ego_inputs(9, episode=4)
     steps = jax.tree.map(lambda x: x[None], input_step(seen))
-    policy = jax.jit(lambda steps: method.logits(run(method, params, steps).head)[0])
+    policy = jax.jit(lambda steps: method.logits(apply_model(method, params, steps).head)[0])
     expected = policy(steps)
-    np.testing.assert_allclose(player(name, 12, False)(seen), expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(compiled_player(name, 12, False)(seen), expected, rtol=1e-4, atol=1e-5)
     # A full window contains the last K steps, like a window of training data.
     last = policy(jax.tree.map(lambda x: x[:, -4:], steps))[-1]
-    np.testing.assert_allclose(player(name, 4, False)(seen)[-1], last, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(compiled_player(name, 4, False)(seen)[-1], last, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -311,16 +317,16 @@ def test_acting_gives_the_outputs_of_training(name):
     ],
 )
 def test_dpt_uses_the_transitions_of_finished_episodes(context, first, positions):
-    method, params = tiny("dpt", positions=positions)
+    method, params = tiny_method("dpt", positions=positions)
     seen = ego_inputs(11, episode=4)  # two finished episodes, then three steps
     known = np.array([0, 1, 2, 4, 5, 6])[first:]  # steps 3 and 7 end episodes and have no next observation
     after = jax.tree.map(lambda x: x[known + 1][None], seen)
     both = jnp.stack([seen.obs[known][None], after.obs], axis=2)
     transitions = Transition(both, after.prev_action, after.prev_reward, after.prev_teammate_action)
-    answer = jax.jit(lambda query: run(method, params, transitions, query).logits[0, -1])
+    answer = jax.jit(lambda query: apply_model(method, params, transitions, query).logits[0, -1])
     expected = [answer(seen.obs[t][None]) for t in (8, 9, 10)]
     np.testing.assert_allclose(
-        player("dpt", context, True, positions=positions)(seen)[8:], np.stack(expected), rtol=1e-4, atol=1e-5
+        compiled_player("dpt", context, True, positions=positions)(seen)[8:], np.stack(expected), rtol=1e-4, atol=1e-5
     )
 
 
@@ -337,7 +343,7 @@ def test_dpt_uses_the_transitions_of_finished_episodes(context, first, positions
 def test_steps_outside_the_context_do_not_affect_outputs(name, context, first_without, cached):
     """The first step leaves AD's window after 5 steps, and DPT's context after two episodes of 3 transitions."""
     seen = ego_inputs(12, episode=4)
-    play = player(name, context, cached)
+    play = compiled_player(name, context, cached)
     changed = seen._replace(obs=seen.obs.at[0].add(3.0))
     difference = np.abs(play(seen) - play(changed)).max(axis=-1)
     assert (difference[first_without - 4 : first_without] > 0).all()
@@ -347,7 +353,9 @@ def test_steps_outside_the_context_do_not_affect_outputs(name, context, first_wi
 def test_full_cached_window_drops_a_fifth_of_its_steps():
     """With K = 10, a full window drops 2 steps, so its length alternates between 9 and 10 steps."""
     seen = ego_inputs(16, episode=4)
-    cached, ten, nine = (player("ad", context, way)(seen) for context, way in ((10, True), (10, False), (9, False)))
+    cached, ten, nine = (
+        compiled_player("ad", context, way)(seen) for context, way in ((10, True), (10, False), (9, False))
+    )
     np.testing.assert_allclose(cached[:10], ten[:10], rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(cached[11::2], ten[11::2], rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(cached[10::2], nine[10::2], rtol=1e-4, atol=1e-5)
@@ -363,17 +371,19 @@ class TestChangeIf:
     def change(params, memory):
         return {"a": memory["a"] * params["scale"], "b": memory["b"] + params["add"]}
 
-    def rows(self, condition, add, memory):
+    def change_row(self, condition, add, memory):
         return change_if(condition, self.change, {"scale": jnp.float32(3), "add": add}, memory)
 
     def test_rows_change_only_if_their_condition_is_true(self):
         add, memory = jnp.array([10, 20, 30]), {"a": jnp.arange(6.0).reshape(3, 2), "b": jnp.arange(3)}
-        changed = jax.jit(jax.vmap(self.rows))(self.CONDITION, add, memory)
+        changed = jax.jit(jax.vmap(self.change_row))(self.CONDITION, add, memory)
         np.testing.assert_array_equal(changed["a"], [[0, 3], [2, 3], [12, 15]])
         np.testing.assert_array_equal(changed["b"], [10, 1, 32])
-        one = jax.jit(self.rows)(self.CONDITION[0], add[0], {"a": memory["a"][0], "b": memory["b"][0]})
+        one = jax.jit(self.change_row)(self.CONDITION[0], add[0], {"a": memory["a"][0], "b": memory["b"][0]})
         np.testing.assert_array_equal(one["b"], changed["b"][0])
-        alike = jax.vmap(self.rows, in_axes=(0, None, None))(self.CONDITION, 5, {"a": jnp.ones(2), "b": jnp.int32(1)})
+        alike = jax.vmap(self.change_row, in_axes=(0, None, None))(
+            self.CONDITION, 5, {"a": jnp.ones(2), "b": jnp.int32(1)}
+        )
         np.testing.assert_array_equal(alike["b"], [6, 1, 6])
 
     def test_change_is_not_computed_if_no_row_needs_it(self):
@@ -417,5 +427,5 @@ def test_amago_learns_to_choose_the_rewarded_action():
 
     params, slow, _ = train(params, optimizer.init(params))
     steps = batch_steps(batch(jax.random.key(9)), plain_view)
-    policy = jax.nn.softmax(method.logits(run(method, params, steps).head))
+    policy = jax.nn.softmax(method.logits(apply_model(method, params, steps).head))
     assert float(policy[..., 2].mean()) > 0.9

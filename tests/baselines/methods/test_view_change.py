@@ -43,7 +43,7 @@ def mirrored_facings(facings: np.ndarray, rows: bool, columns: bool) -> np.ndarr
     return np.array([FACINGS.index(swapped.get(name, name)) for name in FACINGS], np.uint8)[facings]
 
 
-def change(rows: bool, columns: bool, hidden: bool = False) -> ViewChange:
+def view_change(rows: bool, columns: bool, hidden: bool = False) -> ViewChange:
     return ViewChange(*(jnp.asarray(flag) for flag in (hidden, rows, columns)))
 
 
@@ -60,7 +60,7 @@ def test_mirrored_views_equal_views_on_the_mirrored_layout(rows, columns):
     two = start_record(
         other, mirrored_cells(LAYOUT, positions, rows, columns), mirrored_facings(facings, rows, columns), recipe
     )
-    view, seen = change(rows, columns), 0
+    view, seen = view_change(rows, columns), 0
     for _ in range(60):
         expected = observe(other, two, EGO, canonical=True)
         np.testing.assert_array_equal(
@@ -84,11 +84,11 @@ def test_hidden_recipe_indicator_looks_like_a_counter():
         for layout in (both, right)
     )
     assert not np.array_equal(shown, without)
-    np.testing.assert_array_equal(change(False, False, hidden=True).observations(shown), without)
+    np.testing.assert_array_equal(view_change(False, False, hidden=True).observations(shown), without)
     np.testing.assert_array_equal(no_change().observations(shown), shown)
 
 
-def test_view_of_a_batch_is_changed_by_layout_numbers():
+def test_layout_numbers_of_a_batch_determine_how_views_are_changed():
     """The layout number of a row encodes both the layout and how the view is mirrored."""
     layouts = [get_layout("asymm_both"), LAYOUT]
     size = max(record_size(layout) for layout in layouts)
@@ -100,14 +100,14 @@ def test_view_of_a_batch_is_changed_by_layout_numbers():
     numbers = np.array([0, 1, 1 + 2 * 3, 0 + 2 * 1], np.int32)
     seen: Any = jax.jit(changed_view(layouts, hidden=["asymm_both"]))(jnp.asarray(records), numbers)
     plain: Any = jax.jit(changed_view(layouts))(jnp.asarray(records), numbers % 2)
-    expected = [change(False, False, True), no_change(), change(True, True), change(True, False, True)]
+    expected = [view_change(False, False, True), no_change(), view_change(True, True), view_change(True, False, True)]
     for row, view in enumerate(expected):
         np.testing.assert_array_equal(seen[row], view.observations(plain[row]))
     assert len({np.asarray(obs[0]).tobytes() for obs in seen}) == 4
 
 
 def test_mirrored_batches_have_mirrored_actions():
-    """A mirrored batch contains mirrored actions, and encodes in its layout numbers how rows are mirrored."""
+    """A mirrored batch contains mirrored actions; its layout numbers say how each window is mirrored."""
     dataset = load_icrl4aht(layout=["asymm_both", "demo_wide"], split="train", obs="state", channels="canonical")
     layouts = [*reversed(dataset.layouts)]
     sampler = dataset.ad(batch_size=64, length=40, seed=3, labels="expert", teammate_actions=True)
@@ -115,7 +115,7 @@ def test_mirrored_batches_have_mirrored_actions():
     mirroring, number = np.divmod(mirrored.layouts, len(layouts))
     np.testing.assert_array_equal(number, plain.layouts)
     assert set(mirroring) == {0, 1, 2, 3}
-    np.testing.assert_array_equal(mirrored.obs, plain.obs)  # state records are mirrored later, by the view
+    np.testing.assert_array_equal(mirrored.obs, plain.obs)  # the view mirrors state records later
     view = ViewChange(*(jnp.asarray(flag)[:, None] for flag in (mirroring < 0, mirroring % 2 > 0, mirroring > 1)))
     np.testing.assert_array_equal(mirrored.target_actions, view.actions(plain.target_actions.astype(np.int32)))
     assert mirrored.target_actions.dtype == plain.target_actions.dtype

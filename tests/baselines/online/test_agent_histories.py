@@ -33,7 +33,7 @@ def always_interact(layout: Any) -> Policy:
     return Policy((), lambda params, key: (), lambda params, memory, view, key: (jnp.int32(5), memory), "ego_input")
 
 
-def idle(layout: Any) -> Policy:
+def idle_agent(layout: Any) -> Policy:
     return stay(layout)._replace(sees="ego_input")
 
 
@@ -48,7 +48,7 @@ def dataset() -> Any:
 
 @pytest.fixture(scope="module")
 def teammates(dataset) -> Teammates:
-    """Return the teammates of `dataset`; by invented returns, the oracle is useless with the second teammate."""
+    """Return the teammates of `dataset`, with invented returns that make the oracle useless for the second one."""
     found = release_teammates(dataset)
     useless = ReferenceEgos(stay=0.0, random=0.0, oracle=-1000.0, episodes=100)
     return found._replace(references={found.tasks[1].task_id: useless})
@@ -106,15 +106,15 @@ def test_histories_can_be_labelled_by_another_agent(dataset):
 
     tasks = release_teammates(dataset).tasks[:1]
     config = NoiseConfig(1, 10, start=(0.0, 0.0))
-    found = agent_histories.record_histories(idle, tasks, config, make_labeller=count_stays)
+    found = agent_histories.record_histories(idle_agent, tasks, config, make_labeller=count_stays)
     assert (found.actions == STAY).all()
     # The labelling agent counts previous `stay` actions; the first step has no previous action.
     np.testing.assert_array_equal(found.expert_actions[0], (1 + np.maximum(np.arange(1000) - 1, 0)) % 6)
     with pytest.raises(OptionError, match="the labeller takes state, expected ego_input, which the agent takes"):
-        agent_histories.with_noise(idle(None), 10, AGENTS["oracle"](tasks[0].layout))
+        agent_histories.with_noise(idle_agent(None), 10, AGENTS["oracle"](tasks[0].layout))
 
 
-def test_teammates_of_given_tasks_are_added_to_those_of_the_release(dataset):
+def test_teammates_of_given_tasks_are_added_to_teammates_of_the_release(dataset):
     tasks = [task for track in TRACKS for task in read_tasks(manifest_path(track, "train", "diverse"))]
     plain, more = release_teammates(dataset), release_teammates(dataset, number=1, tasks=tasks)
     added = more.tasks[len(plain.tasks) :]
@@ -137,7 +137,7 @@ def test_tasks_on_other_layouts_or_with_learned_teammates_raise_errors(dataset):
 def test_stopped_collection_resumes_to_an_equal_release(release, teammates, tmp_path, monkeypatch):
     played: list[str] = []
 
-    def interrupted_write(*args: Any, **options: Any) -> Any:
+    def interrupt_write(*args: Any, **options: Any) -> Any:
         raise KeyboardInterrupt
 
     def record(make: Any, tasks: Any, *args: Any) -> Any:
@@ -147,7 +147,7 @@ def test_stopped_collection_resumes_to_an_equal_release(release, teammates, tmp_
     original, target = agent_histories.record_histories, tmp_path / "release"
     monkeypatch.setattr(agent_histories, "record_histories", record)
     with monkeypatch.context() as patch:
-        patch.setattr(agent_histories, "write_release", interrupted_write)
+        patch.setattr(agent_histories, "write_release", interrupt_write)
         with pytest.raises(KeyboardInterrupt):
             collect_release(COOK, teammates, CONFIG, target)
     assert not target.exists() and played == ["cramped_up"]

@@ -25,7 +25,7 @@ TINY = ResponseOptions(steps=400, tasks=4)
 DEMO = tasks_of("teammate", "demo_wide")
 
 
-def test_with_headroom_drops_tasks_on_which_the_oracle_gains_little():
+def test_tasks_on_which_the_oracle_gains_little_are_dropped():
     """Headroom is stored by layout and family for test tasks, and by teammate for validation tasks."""
     flat = {task.layout.name for task in tasks_of("teammate")} - {
         task.layout.name for task in responses.with_headroom(tasks_of("teammate"))
@@ -37,7 +37,7 @@ def test_with_headroom_drops_tasks_on_which_the_oracle_gains_little():
 
 @pytest.mark.slow
 def test_teammates_with_the_same_behaviour_share_a_best_response(monkeypatch):
-    """On test_wide, the five H4 teammates behave the same, and the five H3 teammates differ, also in few episodes."""
+    """On test_wide, the five H4 teammates behave alike; the five H3 teammates differ even in few episodes."""
     monkeypatch.setattr(responses, "common_states", cache(lambda layout: (common_records(layout, 1), None)))
     tasks = [task for family in ("H3", "H4") for task in tasks_of("teammate", "test_wide", family)]
     assert [len(alike) for alike in responses.find_behaviours(tasks)] == [1] * 5 + [5]
@@ -51,7 +51,7 @@ def write_finished_job(job, choice: float, earned: float, slope: float = 0.0) ->
     (folder / "result.json").write_text(json.dumps(result))
 
 
-def test_best_response_is_chosen_by_separate_episodes(tmp_path):
+def test_best_response_is_chosen_on_separate_episodes(tmp_path):
     behaviour = (DEMO[0],)
     jobs = [ResponseJob(behaviour, seed, TINY, tmp_path) for seed in range(3)]
     assert not any(job.is_finished() for job in jobs)
@@ -111,7 +111,7 @@ def test_headroom_job_with_fewer_tasks_than_needed_raises_error(tmp_path):
 
 @pytest.mark.slow
 def test_tiny_best_response_and_headroom_jobs_finish(tmp_path, monkeypatch):
-    """Train a best response for one task, and both egos of the headroom on two layouts; repeated calls do nothing."""
+    """Train a best response for one task, and two egos that measure headroom; repeated calls do nothing."""
     monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded", 2))
     monkeypatch.setattr(adaptation, "MEASURED_EPISODES", 2)
     monkeypatch.setattr(trainer, "can_draw", lambda: False)

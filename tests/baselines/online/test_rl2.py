@@ -67,14 +67,14 @@ def trainer() -> PlayTrainer:
 
 
 @pytest.fixture(scope="module")
-def episodes(trainer) -> Any:
+def compiled_episodes(trainer) -> Any:
     """Return the trainer's compiled function that plays two episodes."""
     state = trainer.init()
     return trainer.programs(state.params, state.tasks)[0]
 
 
 @pytest.fixture(scope="module")
-def full_run(trainer, episodes, tmp_path_factory) -> tuple[Path, Any]:
+def full_run(trainer, compiled_episodes, tmp_path_factory) -> tuple[Path, Any]:
     folder = tmp_path_factory.mktemp("rl2") / "run"
     return folder, TrainingTask(METHOD, TrainingData(None, {}), OPTIONS, {}, trainer).train(folder)
 
@@ -107,12 +107,12 @@ def test_sequence_outputs_equal_step_by_step_outputs():
         method.loss(params, None, None, None)
 
 
-def test_training_sequences_match_the_played_episodes(trainer, episodes):
+def test_training_sequences_match_the_played_episodes(trainer, compiled_episodes):
     """Training sequences contain the actions and rewards of two played episodes and the memory before them."""
     player, state = trainer.players[0], trainer.init()
     tasks, key = state.tasks[0], jax.random.key(3)
     for number in range(3):  # a task that has not ended continues in the next episodes
-        after, played, returns = episodes(state.params, player.mates, tasks, jax.random.fold_in(key, number))
+        after, played, returns = compiled_episodes(state.params, player.mates, tasks, jax.random.fold_in(key, number))
         assert played.action.shape == (200, 8)
         np.testing.assert_array_equal(played.seen.prev_action[1:], played.action[:-1])
         by_episode = played.reward.reshape(2, 100, 8).sum(axis=1)
@@ -139,10 +139,10 @@ def test_training_log_has_losses_and_falling_imitation_weight(full_run):
     assert {"return cramped_up assembly_line", "policy_loss", "value_loss", "entropy", "loss"} <= lines[0].keys()
 
 
-def test_imitation_loss_makes_the_actions_of_the_script_likelier(trainer, episodes):
+def test_imitation_loss_makes_the_actions_of_the_script_likelier(trainer, compiled_episodes):
     """On fixed episodes, only a positive imitation weight makes the actions of the script likelier."""
     state = trainer.init()
-    _, played, _ = episodes(state.params, trainer.players[0].mates, state.tasks[0], jax.random.key(0))
+    _, played, _ = compiled_episodes(state.params, trainer.players[0].mates, state.tasks[0], jax.random.key(0))
     fallen = {}
     for weight in (0.0, 5.0):
         params, optimizer = jax.tree.map(jnp.copy, (state.params, state.optimizer))
@@ -181,7 +181,7 @@ def test_previous_actions_of_a_first_step_are_not_mirrored():
 
 
 @pytest.mark.slow
-def test_batch_of_several_layouts_gives_results_of_single_layouts():
+def test_batch_of_several_layouts_gives_the_same_results_as_single_layouts():
     """Tasks of a layout give equal results in a batch of several layouts and in a batch of this layout alone."""
     layouts = rearranged_layouts(LAYOUT, 3)[::2]
     mate = build_teammate(None, sample_teammate("assembly_line", 0, "train"))
@@ -203,8 +203,8 @@ def test_batch_of_several_layouts_gives_results_of_single_layouts():
     assert (np.asarray(found.seen.obs[:, 0]) != np.asarray(expected.seen.obs[:, 0])).any()
 
 
-class TestGroups:
-    def test_layouts_get_tasks_by_share_split_evenly_over_families(self):
+class TestTaskGroups:
+    def test_tasks_of_a_layout_follow_its_share_and_are_split_evenly_over_families(self):
         wide = get_layout("demo_wide")
         mates = {(LAYOUT, "a"): teammates(1), (LAYOUT, "b"): teammates(1), (wide, "a"): teammates(3)}
         groups = make_groups(mates, 40, {LAYOUT.name: 1.0, wide.name: 0.25}, hidden=[wide.name])
@@ -214,7 +214,7 @@ class TestGroups:
             ("demo_wide a", 8, True),
         ]
 
-    def test_teammates_are_chosen_nearly_equally_often_with_several_behaviours(self):
+    def test_teammates_are_used_about_equally_often_and_show_several_behaviours(self):
         (eight,), (four,), (group,) = (
             make_groups({(LAYOUT, "a"): teammates(mates)}, tasks, {LAYOUT.name: 1.0})
             for mates, tasks in ((3, 8), (10, 4), (3, 60))
@@ -250,7 +250,7 @@ class TestGroups:
 
 
 def played_actions(mates: list[Policy]) -> list[np.ndarray]:
-    """Return 40 actions of each teammate in the start state of an episode."""
+    """Return 40 actions of each teammate, all chosen in the start state of an episode."""
     cells, facings = np.array(LAYOUT.agent_cells, np.uint8), np.zeros(2, np.uint8)
     record = jnp.asarray(start_record(LAYOUT, cells, facings, LAYOUT.recipe_items[0]))
     act = jax.jit(mates[0].act)
@@ -264,7 +264,7 @@ def played_actions(mates: list[Policy]) -> list[np.ndarray]:
     return found
 
 
-class TestPreparing:
+class TestPreparation:
     """Preparation of RL^2 training: teammates and layouts from histories, manifests and rearranged layouts."""
 
     MODEL = dataclasses.replace(ModelOptions(**RL2_SETTINGS["model"]), width=8)
@@ -278,7 +278,7 @@ class TestPreparing:
         plain, job = (self.prepare(PlayOptions(), of, batch=128) for of in ((), tasks))
         assert plain.about["trained_on"] == [cell for cell in job.about["trained_on"] if cell["source"] != "tasks"]
         added = {cell["algorithm"]: cell for cell in job.about["trained_on"] if cell["source"] == "tasks"}
-        here = [task for task in tasks if task.layout.name == "cramped_up"]  # only tasks on the chosen layout
+        here = [task for task in tasks if task.layout.name == "cramped_up"]  # only tasks on this layout are added
         assert sum(cell["tasks"] for cell in added.values()) == len(here)
         assert {cell["layout"] for cell in added.values()} == {"cramped_up"}
         ids = {teammate_id(task.teammate) for task in here}
@@ -288,7 +288,7 @@ class TestPreparing:
         assert sum(job.about["histories"]["groups"].values()) == job.trainer.tasks
 
     def test_rearranged_and_four_recipe_layouts_are_added_in_proportion(self):
-        """The numbers of tasks of any two rearranged versions of a layout differ by at most one."""
+        """The rearranged versions of a layout have nearly equal numbers of tasks, which differ by at most one."""
         play = PlayOptions(rearranged=6, four_recipes=True)
         players = self.prepare(play).trainer.players
         groups = [group for player in players for group in player.groups]
@@ -316,7 +316,7 @@ class TestPreparing:
         assert job.about["histories"]["layouts"] == ["cramped_down"]
 
     def test_tasks_keep_the_recipe_that_their_teammate_prefers(self):
-        """Tasks chosen by histories and tasks of a manifest both keep one preferred recipe for each teammate."""
+        """Each task, from histories or from a manifest, has one recipe, which its teammate prefers."""
         name = "asymm_both_plain"
         tasks = [one for one in read_tasks(manifest_path("preference", "train")) if one.layout.name == name]
         of_histories = self.prepare(PlayOptions(), (), HistoryOptions((name,), source=("search",)), 256)

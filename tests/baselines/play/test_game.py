@@ -1,4 +1,4 @@
-"""Test games of people and policies: returns equal an evaluation's, and egos can play in either slot."""
+"""Test games of people and policies: returns equal those of an evaluation, and egos can play in either slot."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EPISODES, STEPS = 2, 60
 
 
 def test_game_of_two_policies_has_the_returns_of_an_evaluation():
-    """A game with the NumPy rules gives the returns of the compiled evaluation."""
+    """A game that uses the NumPy rules gives the same returns as the compiled evaluation."""
     partner = find_partner("H4/t0", LAYOUT, 1)
     assert partner.task
     ego = find_partner("rl2-reference", LAYOUT, 0)
@@ -37,7 +37,7 @@ def test_game_of_two_policies_has_the_returns_of_an_evaluation():
 
 
 def test_egos_can_play_in_the_teammate_slot():
-    """In the teammate's slot, an ego receives observations of this slot, and the oracle can plan and deliver."""
+    """In the teammate's slot, egos receive the observations of that slot, and the oracle can make deliveries."""
     seen = []
 
     def act(params, memory, view, key):

@@ -29,7 +29,7 @@ STEPS = 12
 
 @pytest.fixture
 def game_server(tmp_path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """Serve a recorded game of one episode; yield the address of the page and the server process."""
+    """Serve a game of one episode and record it; yield the address of the page and the server process."""
     words = f"play --layout cramped_up --with H2/t3 --episodes 1 --steps {STEPS} --ticks 0 --port 0 --seed 3".split()
     command = [sys.executable, "-u", "-m", "icrl4aht_data", *words, "--record", str(tmp_path / "record")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
@@ -44,7 +44,7 @@ def game_server(tmp_path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
 
 @pytest.fixture
 def page(game_server) -> Iterator[Any]:
-    """Open the page of the game in a window of a phone's size."""
+    """Open the page of the game in a window as wide as a phone."""
     with chromium() as open_page:
         page = open_page(game_server[0], PHONE, has_touch=True)
         wait_until(page, "setup !== undefined")

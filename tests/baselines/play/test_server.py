@@ -36,7 +36,7 @@ ORIGIN = {"origin": "http://127.0.0.1"}
 def new_session(
     partner: str = "stay", episodes: int = 2, steps: int = 8, record: Path | None = None, **options: Any
 ) -> PlaySession:
-    """Return a session that steps only when a test sends an action, without egos to compare with."""
+    """Return a session without reference egos, in which the game steps only when a test sends an action."""
     found = find_partner(partner, LAYOUT, 1)
     recorder, name = None, "a test"
     if record:
@@ -67,18 +67,18 @@ class Browser:
 
 
 @contextmanager
-def browser(client: Any, slot: str = "") -> Iterator[Browser]:
+def open_browser(client: Any, slot: str = "") -> Iterator[Browser]:
     with client.websocket_connect(f"ws://127.0.0.1/play?slot={slot}", headers=ORIGIN) as socket:
         yield Browser(socket)
 
 
-def client_of(session: PlaySession) -> Any:
+def make_client(session: PlaySession) -> Any:
     return starlette.TestClient(make_app(session), base_url="http://127.0.0.1")
 
 
 def test_keys_move_the_agent_by_the_rules():
     session = new_session()
-    with client_of(session) as client, browser(client) as player:
+    with make_client(session) as client, open_browser(client) as player:
         assert "arrow keys" in client.get("/").text
         assert player.setup["actions"] == list(ACTIONS)
         assert (player.frame["waiting"], player.frame["clock"]) == (True, 0)
@@ -108,7 +108,7 @@ def play_by_oracle(player: Browser, episodes: int, steps: int) -> None:
 def test_recorded_game_is_a_valid_release(tmp_path):
     """The record is a valid release with the person's pseudonym, which is written only after consent."""
     session = new_session("H2/t3", episodes=2, steps=100, record=tmp_path / "record")
-    with client_of(session) as client, browser(client) as player:
+    with make_client(session) as client, open_browser(client) as player:
         assert "Nothing else is stored" in player.setup["consent"]
         player.socket.send_json({"action": LEFT})  # the server ignores keys before the consent
         assert player.send(pseudonym="a@b.org", agrees=True)["kind"] == "problem"
@@ -140,11 +140,11 @@ def test_recorded_game_is_a_valid_release(tmp_path):
 
 def test_game_continues_after_a_lost_connection():
     session = new_session(episodes=1)
-    with client_of(session) as client:
-        with browser(client) as player:
+    with make_client(session) as client:
+        with open_browser(client) as player:
             player.act(STAY, LEFT, RIGHT, INTERACT)
             record = player.frame["record"]
-        with browser(client) as player:
+        with open_browser(client) as player:
             assert (player.frame["clock"], player.frame["record"]) == (3, record)
             assert player.frame["waiting"]
             player.act(STAY, *[STAY] * 5)
@@ -157,7 +157,7 @@ def test_failed_record_write_is_shown_and_retried(tmp_path, monkeypatch):
     session = new_session("H2/t3", episodes=2, steps=3, record=tmp_path / "record")
     assert session.recorder
     session.recorder.pseudonym = "someone"
-    with client_of(session) as client, browser(client) as player:
+    with make_client(session) as client, open_browser(client) as player:
         with monkeypatch.context() as patch:
             patch.setattr(session.recorder, "write", lambda game: (tmp_path / "no" / "folder").touch())
             player.act(STAY, STAY, STAY, STAY)
@@ -169,13 +169,13 @@ def test_failed_record_write_is_shown_and_retried(tmp_path, monkeypatch):
 
 def test_two_people_play_and_each_is_shown_as_agent_0():
     session = new_session("human")
-    with client_of(session) as client, browser(client) as one:
+    with make_client(session) as client, open_browser(client) as one:
         assert one.frame["missing"] == 1
-        with browser(client) as two:
+        with open_browser(client) as two:
             assert (one.setup["slot"], two.setup["slot"]) == (0, 1)
             assert one.socket.receive_json()["missing"] == 0
             assert two.frame["record"][:2] == one.frame["record"][1::-1]
-            with pytest.raises(starlette.WebSocketDisconnect) as closed, browser(client):
+            with pytest.raises(starlette.WebSocketDisconnect) as closed, open_browser(client):
                 pass
             assert closed.value.code == 4000
             assert one.send(action=STAY)["ready"]
@@ -187,12 +187,12 @@ def test_two_people_play_and_each_is_shown_as_agent_0():
             assert one.socket.receive_json()["clock"] == 1
         lost = one.socket.receive_json()
         assert (lost["missing"], lost["waiting"], lost["clock"]) == (1, True, 1)
-        with browser(client, slot="1") as two:
+        with open_browser(client, slot="1") as two:
             assert two.setup["slot"] == 1
 
 
-def test_steps_follow_a_clock_without_keys():
-    with client_of(new_session(episodes=1, steps=5, ticks=50)) as client, browser(client) as player:
+def test_game_steps_at_a_fixed_rate_if_no_key_is_pressed():
+    with make_client(new_session(episodes=1, steps=5, ticks=50)) as client, open_browser(client) as player:
         player.act(STAY)
         while not player.frame["over"]:
             player.frame = player.socket.receive_json()
@@ -207,7 +207,7 @@ def test_session_compares_the_person_with_reference_egos():
 
 
 def test_requests_from_other_websites_are_refused():
-    with client_of(new_session()) as client:
+    with make_client(new_session()) as client:
         with (
             pytest.raises(starlette.WebSocketDisconnect),
             client.websocket_connect("ws://127.0.0.1/play", headers={"origin": "http://evil.example"}),

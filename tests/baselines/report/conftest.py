@@ -1,4 +1,4 @@
-"""Invented best responses, so that tests of scores do not depend on those of the package."""
+"""Fixtures that replace the package's best responses, which tests of scores must not depend on."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ import pytest
 
 from icrl4aht_data.benchmark import best_responses
 from icrl4aht_data.benchmark.best_responses import BestResponseCard, write_best_responses
-from tests.helpers.evaluated import write_measured
+from tests.helpers.evaluated import write_invented_responses
 
 
 @pytest.fixture(scope="session")
 def response_files(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("cards")
-    write_measured(folder / "measured.json")
+    write_invented_responses(folder / "measured.json")
     write_best_responses(folder / "none.json", BestResponseCard("0", "seeded", "None measured."))
     return folder
 
 
 @pytest.fixture(scope="module", autouse=True)
-def no_responses(response_files) -> Iterator[None]:
-    """Replace the package's best responses by an empty set."""
+def empty_responses(response_files) -> Iterator[None]:
+    """Replace the package's best responses with an empty set."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(best_responses, "best_responses_file", lambda: response_files / "none.json")
         yield
 
 
 @pytest.fixture
-def invented_responses(no_responses, response_files, monkeypatch) -> None:
-    """Replace the package's best responses by the invented ones of `write_measured`."""
+def invented_responses(empty_responses, response_files, monkeypatch) -> None:
+    """Replace the package's best responses with the invented ones that `write_invented_responses` writes."""
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: response_files / "measured.json")

@@ -27,7 +27,7 @@ LOW, HIGH = [0.0] * 5 + [10.0] * 95, [10.0] * 5 + [20.0] * 95
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory) -> StoredResults:
-    """Return results on the layout track of two agents: `high`, which needs its memory, and `low`."""
+    """Return results of two agents on the layout track: `high`, which needs its memory, and `low`."""
     folder = tmp_path_factory.mktemp("results")
     write_results(folder / "high", "high", HIGH, offset=1.0)
     write_results(folder / "high" / "cleared", "high (cleared)", [5.0] * 100, offset=0.5, forget=True)
@@ -39,7 +39,7 @@ def stored(tmp_path_factory) -> StoredResults:
     return found
 
 
-def row(table: str, agent: str) -> list[str]:
+def agent_row(table: str, agent: str) -> list[str]:
     (line,) = [line for line in table.splitlines() if line.startswith(f"| `{agent}` ")]
     return [cell.strip() for cell in line.strip("|").split(" | ")]
 
@@ -58,7 +58,7 @@ def test_stored_results_have_episode_blocks_and_curves_and_can_be_read_again(sto
 def test_agents_table_has_scores_of_complete_tracks_only(stored, invented_responses):
     scales = cell_scales("seeded")
     table = comparison.agents_table(stored, stored.returns(), scales)
-    high, low = row(table, "high"), row(table, "low")
+    high, low = agent_row(table, "high"), agent_row(table, "low")
     assert high[1:6] == ["noise", "oracle", "10 updates, 2 core-hours", "–", "–"], "no track teammate"
     # Score: (return - stay) / 20; the mean return of `stay` is 12.0 on asymm_right and 0.0 on cramped_down.
     stays = np.mean([np.mean([scale.stay for cell, scale in scales.items() if cell.layout == name])
@@ -80,7 +80,7 @@ def test_lead_is_the_difference_of_the_two_highest_scores(tmp_path, invented_res
 
 def test_controls_table_has_memory_and_partner_controls_and_episode_blocks(stored, invented_responses):
     table = comparison.controls_table(stored, stored.returns(), cell_scales("seeded"))
-    high, low = row(table, "high"), row(table, "low")
+    high, low = agent_row(table, "high"), agent_row(table, "low")
     assert high[1].startswith("**+15.5 (") and high[1].endswith(")**"), "19.5 + 2 - (5 + 1)"
     assert high[2] == "+0.0 (+0.0 to +0.0)" and high[3:] == ["12.0", "12.0", "22.0", "22.0"]
     assert low[1:] == ["–", "–", "0.0", "0.0", "10.0", "10.0"]
@@ -88,15 +88,15 @@ def test_controls_table_has_memory_and_partner_controls_and_episode_blocks(store
 
 def test_layouts_table_has_reference_egos_and_returns_by_layout(stored, invented_responses):
     table = comparison.layouts_table(stored.returns(), cell_scales("seeded"))
-    assert row(table, "stay")[1:4] == ["12.8", "13.0", "12.7"] and "| best response | 12.8 | 18.0 |" in table
-    low = row(table, "low")
+    assert agent_row(table, "stay")[1:4] == ["12.8", "13.0", "12.7"] and "| best response | 12.8 | 18.0 |" in table
+    low = agent_row(table, "low")
     assert low[1] == "–" and low[8] == "9.5 (0.47)" and float(low[10]) == pytest.approx(26.0 - 9.5, abs=0.1)
     assert low[9].endswith("asymm_right H4"), "stay earns 40 there"
     none = comparison.layouts_table(stored.returns(), {})
-    assert row(none, "low")[7:] == ["9.5", "9.5", "–", "–"] and "| best response | – |" in none
+    assert agent_row(none, "low")[7:] == ["9.5", "9.5", "–", "–"] and "| best response | – |" in none
 
 
-def test_mean_best_uses_stay_for_families_without_best_response(invented_responses):
+def test_mean_best_return_uses_stay_for_families_without_best_response(invented_responses):
     scales, stay = cell_scales("seeded"), read_headroom("seeded")
     ring = [cell for cell in scales if cell.layout == "coord_ring"]
     h2 = next(cell for cell in ring if cell.family == "H2")

@@ -11,7 +11,7 @@ from icrl4aht_baselines.report.page import write_page
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, ResultCell
 from PIL import Image
 
-from tests.helpers.chromium import NEEDS_CHROMIUM, PHONE, check_phone, chromium
+from tests.helpers.chromium import NEEDS_CHROMIUM, PHONE, check_fits_phone, chromium
 from tests.helpers.evaluated import evaluated_run
 
 pytestmark = [pytest.mark.slow, NEEDS_CHROMIUM]
@@ -23,7 +23,7 @@ TOO_WIDE = """(width) => [...document.body.querySelectorAll("*")]
 
 
 @pytest.fixture(scope="module")
-def file(tmp_path_factory) -> Path:
+def report_file(tmp_path_factory) -> Path:
     """Write a report with every section, all layouts, long names and pictures of episodes; return its path."""
     folder = tmp_path_factory.mktemp("report")
     Image.fromarray(np.zeros((400, 900), np.uint8)).save(folder / "a.gif")
@@ -38,10 +38,10 @@ def file(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("dark", [False, True])
-def test_report_fits_the_width_of_a_phone(file, dark):
+def test_report_fits_the_width_of_a_phone(report_file, dark):
     with chromium() as open_page:
-        page = open_page(file.as_uri(), PHONE, dark)
+        page = open_page(report_file.as_uri(), PHONE, dark)
         page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true })")
         assert page.locator("section").count() == 6
         assert page.evaluate(TOO_WIDE, PHONE) == []
-        check_phone(page, dark)
+        check_fits_phone(page, dark)

@@ -29,7 +29,7 @@ GIF = b"GIF89a"  # an incomplete image, which the report does not decode
 EVIL = '<img src=x onerror="alert(1)">&co'
 
 
-class Elements(HTMLParser):
+class PageElements(HTMLParser):
     """An HTML parser that collects external addresses, scripts and images of a page."""
 
     def __init__(self, text: str) -> None:
@@ -63,7 +63,7 @@ def test_html_report_is_complete_and_loads_no_external_files(tmp_path):
         EpisodePair(ResultCell("demo_wide", "rl"), "an ego", "No picture: <its run> is gone"),
     ]
     text = write_page(runs, tmp_path / "r" / "report.html", episodes, ["left out: <nothing>"]).read_text()
-    found = Elements(text)
+    found = PageElements(text)
     assert (found.outside, found.open, found.images) == ([], [], ["data:image/gif"] * 2)
     for section in ("summary", "curves", "episodes", "tables", "settings", "paper"):
         assert f'<section id="{section}">' in text and f'href="#{section}"' in text
@@ -82,13 +82,13 @@ def test_html_in_names_is_escaped_in_all_reports(tmp_path):
     source = run.sources[0]._replace(trained={"config": {"method": EVIL, "model": {EVIL: 2}}, "run_hash": "ab12"})
     run = dataclasses.replace(run, sources=(source,))
     text = write_page([run], tmp_path / "report.html").read_text()
-    assert Elements(text).outside == [] and EVIL not in text and EVIL in unescape(text)
+    assert PageElements(text).outside == [] and EVIL not in text and EVIL in unescape(text)
     text = markdown([run])
     assert "<img" not in text and '&lt;img src=x onerror="alert(1)"&gt;&amp;co' in text
     assert "<br>episodes 1: 10.0, " in text, "line breaks in table cells are not escaped"
 
 
-def test_html_report_names_conditions_once_and_marks_overlaps(tmp_path):
+def test_html_report_states_conditions_once_and_marks_overlaps(tmp_path):
     record = [{"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["00"]}]
     runs = [evaluated_run("AD", trained_on=record), evaluated_run("mine", trained_on=None)]
     text = unescape(write_page(runs, tmp_path / "report.html").read_text())
@@ -143,7 +143,7 @@ def test_curves_share_axes_and_can_have_one_episode():
 
 
 def test_model_cards_describe_the_training_data():
-    """The card of each bundled model contains the training-data sentence that its configuration gives."""
+    """The card of each bundled model contains the sentences that `training_sentence` writes for its training runs."""
     for name in ("ad-reference", "ad-rising", "dpt-reference", "rl2-reference"):
         configs = [json.loads((MODELS / name / track / "config.json").read_text()) for track in TRACKS]
         card = (MODELS / name / "README.md").read_text(encoding="utf-8")
@@ -175,11 +175,11 @@ def test_shown_episodes_are_of_tasks_with_headroom(invented_responses, tmp_path,
     monkeypatch.setattr(gifs, "save_episodes", lambda *a, **k: (ShownEpisode(1, 7.0, tmp_path / "a.gif"),))
     monkeypatch.setattr(gifs, "restore_ego", lambda source: source)
 
-    def run_of(agent: str, **options) -> EvaluationRun:
+    def fake_run(agent: str, **options) -> EvaluationRun:
         layouts, folder = ("coord_simple", "demo_wide"), f"runs/{agent}{options}"
         return evaluated_run(agent, layouts, families=("H1", "H4"), folder=folder, **options)
 
-    runs = [run_of("stay"), run_of("oracle"), run_of("AD"), run_of("AD", note="K250"), run_of("DPT")]
+    runs = [fake_run("stay"), fake_run("oracle"), fake_run("AD"), fake_run("AD", note="K250"), fake_run("DPT")]
     drawn: list[tuple[int, int]] = []
     path = tmp_path / "report.html"
     text = write_page_with_episodes(runs, path, progress=lambda what, *counts: drawn.append(counts)).read_text()
@@ -220,7 +220,7 @@ def test_evaluate_and_report_commands_write_results_tables_and_page(tmp_path, mo
     assert "| H4 | stay | 0.0<br>1 of 5 instances<br>episodes 1: 0.0, 2-5: 0.0<br>no headroom |" in printed
     assert {path.name for path in (tmp_path / "run" / "report").iterdir()} == {"report.md", "report.csv"}
     text = (tmp_path / "report.html").read_text()
-    assert Elements(text).images.count("data:image/gif") == 4
+    assert PageElements(text).images.count("data:image/gif") == 4
     assert "<h4>stay with H4/t77 (training) on demo_wide</h4>" in text
     assert f"Task {own.task_id}, protocol published, seed 0." in text
     captions = re.findall(r"<figcaption>(Episode [^<]+)<", text)

@@ -111,7 +111,7 @@ def test_runs_of_one_agent_on_different_layouts_are_merged():
     assert [source.layouts for source in both.sources] == [("demo_wide",), ("coord_simple",)]
 
 
-def test_runs_of_other_conditions_or_same_tasks_are_not_merged():
+def test_runs_with_different_conditions_or_equal_tasks_are_not_merged():
     one = evaluated_run("AD", acting="cached")
     for other, label in (
         (evaluated_run("AD", value=3.0), "AD [runs/AD]"),

@@ -1,4 +1,4 @@
-"""Test scores relative to best responses, tables, summaries and the paper's numbers against known values."""
+"""Test scores relative to best responses, and the tables and summaries that show scores and published numbers."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_respo
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
 from icrl4aht_data.errors import OptionError
-from tests.helpers.evaluated import SPAN, TEST_TASKS, evaluated_run, write_measured
+from tests.helpers.evaluated import SPAN, TEST_TASKS, evaluated_run, write_invented_responses
 
 DEMO_WIDE = [ResultCell("demo_wide", family) for family in HEURISTICS]
 WIDE, RING, FLAT = ResultCell("demo_wide", "H1"), ResultCell("coord_ring", "H2"), ResultCell("demo_simple", "H1")
 
 
-def returns_of(*values: float, seeds: int = 3) -> CellReturns:
+def cell_returns(*values: float, seeds: int = 3) -> CellReturns:
     """Return invented results of tasks t0, t1 and so on; all seeds of a task earn the same."""
     found = np.repeat(np.array(values)[None, :, None], seeds, axis=2)
     tasks = tuple(f"t{number}" for number in range(len(values)))
     return CellReturns(tasks, tuple(range(seeds)), {"all": found, "last 20": found + 1})
 
 
-def scale_of(*tasks: tuple[float, float, str]) -> CellScale:
+def cell_scale(*tasks: tuple[float, float, str]) -> CellScale:
     return CellScale({f"t{number}": TaskScale(*task) for number, task in enumerate(tasks)})
 
 
 SCALES = {
-    WIDE: scale_of((0.0, 10.0, "a"), (5.0, 25.0, "b"), (0.0, 10.0, "c"), (0.0, 10.0, "c")),
-    RING: scale_of((0.0, 40.0, "d"), (0.0, 40.0, "e"), (0.0, 1.0, "f")),
-    FLAT: scale_of((10.0, 14.0, "g")),
+    WIDE: cell_scale((0.0, 10.0, "a"), (5.0, 25.0, "b"), (0.0, 10.0, "c"), (0.0, 10.0, "c")),
+    RING: cell_scale((0.0, 40.0, "d"), (0.0, 40.0, "e"), (0.0, 1.0, "f")),
+    FLAT: cell_scale((10.0, 14.0, "g")),
 }
 
 
 def test_score_is_a_ratio_of_sums_on_each_layout():
-    cells = {WIDE: returns_of(5.0, 15.0, 0.0, 10.0), RING: returns_of(10.0, 10.0, 7.0), FLAT: returns_of(99.0)}
+    cells = {WIDE: cell_returns(5.0, 15.0, 0.0, 10.0), RING: cell_returns(10.0, 10.0, 7.0), FLAT: cell_returns(99.0)}
     assert scores.open_cells(SCALES) == [RING, WIDE], "FLAT has headroom of less than 5"
     score = scores.find_score(cells, [RING, WIDE], SCALES)
     assert score is not None
@@ -52,11 +52,11 @@ def test_score_is_a_ratio_of_sums_on_each_layout():
     assert score.middle.mean == pytest.approx((0.25 + 0.5 + 0.5) / 3) and score.worst == ("coord_ring H2", 0.25)
     assert score.regret == pytest.approx(((50 - 25) + (81 - 27)) / 7)
     assert scores.find_score(cells, [RING, FLAT], SCALES) is None and scores.find_score(cells, [], SCALES) is None
-    assert scores.find_score({WIDE: returns_of(5.0, 5.0)}, [WIDE], SCALES) is None, "tasks are missing"
+    assert scores.find_score({WIDE: cell_returns(5.0, 5.0)}, [WIDE], SCALES) is None, "tasks are missing"
 
 
 def test_score_differences_are_paired_by_task_and_seed():
-    one, other = returns_of(5.0, 15.0, 0.0, 10.0), returns_of(10.0, 0.0, 10.0, 15.0, seeds=1)
+    one, other = cell_returns(5.0, 15.0, 0.0, 10.0), cell_returns(10.0, 0.0, 10.0, 15.0, seeds=1)
     shuffled = other._replace(tasks=("t3", "t2", "t0", "t1"))  # task t3 earns 10.0
     difference = scores.score_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], SCALES)
     assert difference.mean == pytest.approx(((5 - 10) + (15 - 15) + (0 - 0) + (10 - 10)) / 50)
@@ -68,13 +68,13 @@ def test_score_differences_are_paired_by_task_and_seed():
 
 def test_teammates_with_equal_behaviour_count_as_one_unit():
     """The interval over five teammates with equal behaviour is the interval over the seeds of one teammate."""
-    alike = {WIDE: scale_of(*[(0.0, 20.0, "same")] * 5)}
+    alike = {WIDE: cell_scale(*[(0.0, 20.0, "same")] * 5)}
     values = np.broadcast_to([2.0, 4.0, 6.0, 8.0], (1, 5, 4))
     found = CellReturns(tuple(f"t{number}" for number in range(5)), (0, 1, 2, 3), {"all": values})
     one = found._replace(tasks=("t0",), blocks={"all": values[:, :1]})
     pair = [scores.find_score({WIDE: of}, [WIDE], alike) for of in (found, one)]
     assert pair[0] and pair[1] is None
-    single = scores.find_score({WIDE: one}, [WIDE], {WIDE: scale_of((0.0, 20.0, "same"))})
+    single = scores.find_score({WIDE: one}, [WIDE], {WIDE: cell_scale((0.0, 20.0, "same"))})
     assert single and single.total == pytest.approx(pair[0].total) and pair[0].total.range()
 
 
@@ -104,7 +104,7 @@ def test_score_scales_cover_all_tasks_with_a_best_response(invented_responses):
 def test_damaged_file_of_best_responses_raises_error(tmp_path):
     with pytest.raises(OptionError, match=r"none\.json: no such file, expected best responses"):
         read_best_responses(tmp_path / "none.json")
-    card = read_best_responses(write_measured(tmp_path / "b.json"))
+    card = read_best_responses(write_invented_responses(tmp_path / "b.json"))
     assert card.version == "7" and isinstance(card.behaviours[0], BestResponse)
     text = (tmp_path / "b.json").read_text()
     (tmp_path / "twice.json").write_text(text.replace('"behaviours": [', f'"behaviours": [{text.splitlines()[5]}', 1))
@@ -134,13 +134,13 @@ def test_results_without_a_score_have_a_reason(invented_responses):
     assert published.why_no_score == "No score: best responses were measured under protocol seeded."
 
 
-def test_results_of_other_episode_lengths_show_no_paper_numbers():
+def test_results_with_other_episode_lengths_show_no_paper_numbers():
     run = evaluated_run("AD", protocol="published", steps=20)
     found = page.table_score(DEMO_WIDE[:1], run, "published", (1.0, 1.0))
     assert found.notes == ["episodes 1: 10.0, 2-5: 10.0, 6-20: 10.0, 21-100: 12.0"]
 
 
-def test_returns_tables_have_our_numbers_and_the_papers():
+def test_returns_tables_show_measured_and_published_numbers():
     runs = [evaluated_run(agent, ("demo_wide", "cramped_down"), protocol="published") for agent in ("AD", "mine")]
     (table,) = page.returns_tables(runs, "published")
     assert list(table.columns) == ["demo_wide", "cramped_down", page.AVERAGE]

@@ -28,7 +28,7 @@ def test_interval_and_p_value_of_normal_values_are_close_to_students_t():
     assert mean_interval(values) == found, "the random numbers are fixed"
 
 
-def test_intervals_of_equal_few_or_no_values_are_defined():
+def test_interval_of_equal_values_is_a_point_and_of_too_few_values_is_nan():
     found = mean_interval(np.full(5, 7.0), np.full((3, 2), 1.0))
     assert found[:3] == (4.0, 4.0, 4.0) and found.p == 0 and found.text() == "4.0 (4.0 to 4.0)"
     pair = mean_interval(np.array([[1.0, 2.0]]))

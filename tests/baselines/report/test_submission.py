@@ -21,7 +21,7 @@ FACTS = AgentFacts("a rule", "none", "none")
 
 
 @pytest.fixture(scope="module")
-def submitted(tmp_path_factory) -> Path:
+def submission_file(tmp_path_factory) -> Path:
     """Write a submission of two training runs of an agent; the second run also has results with memory cleared."""
     folder = tmp_path_factory.mktemp("submitted")
     write_results(folder / "one", "rule", CURVE)
@@ -31,8 +31,8 @@ def submitted(tmp_path_factory) -> Path:
     return folder / "rule.json"
 
 
-def test_submission_has_all_results_of_all_folders(submitted):
-    found = read_submission(submitted)
+def test_submission_has_all_results_of_all_folders(submission_file):
+    found = read_submission(submission_file)
     assert (found.agent, found.tracks, found.facts.about) == ("rule", ["layout"], "a rule")
     parts = [(one.control, one.training, len(one.returns)) for one in found.evaluations]
     assert parts == [("", 0, 40), ("", 1, 40), ("cleared", 1, 40)]
@@ -77,9 +77,9 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: c["facts"].update(data=""), "Expected `str` of length >= 1 - at `\\$.facts.data`"),
     ],
 )  # fmt: skip
-def test_incomplete_or_invalid_submission_raises_error(submitted, tmp_path, change, message):
+def test_incomplete_or_invalid_submission_raises_error(submission_file, tmp_path, change, message):
     with pytest.raises(OptionError, match=message) as caught:
-        read_submission(changed_submission(submitted, tmp_path / "bad.json", change))
+        read_submission(changed_submission(submission_file, tmp_path / "bad.json", change))
     assert str(caught.value).startswith(str(tmp_path / "bad.json"))
 
 
@@ -100,7 +100,7 @@ def test_results_that_cannot_be_submitted_raise_errors(tmp_path):
             make_submission([folder], FACTS)
 
 
-def test_submit_and_results_commands_write_file_and_page(submitted, tmp_path, monkeypatch):
+def test_submit_and_results_commands_write_file_and_page(submission_file, tmp_path, monkeypatch):
     monkeypatch.setattr(comparison, "results_file", lambda: tmp_path / "stored.json")
     folder = str(write_results(tmp_path / "mine", "mine", CURVE))
     said = ["--about", "a rule", "--data", "none", "--labels", "none", "--core-hours", "1.5", "--name", "my rule"]
@@ -108,7 +108,7 @@ def test_submit_and_results_commands_write_file_and_page(submitted, tmp_path, mo
     assert "mine.json: my rule, layout;" in printed
     assert read_submission(tmp_path / "mine.json").facts.core_hours == 1.5
     assert json.loads(run_cli("submit", "--schema"))["$defs"]["AgentFacts"]
-    page = ["results", str(submitted), str(tmp_path / "mine.json"), "--out", str(tmp_path / "page")]
+    page = ["results", str(submission_file), str(tmp_path / "mine.json"), "--out", str(tmp_path / "page")]
     run_cli(*page)
     text = (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
     assert "| `my rule` | none | none | 1.5 core-hours |" in text and "| `rule` † |" in text

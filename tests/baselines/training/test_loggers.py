@@ -26,7 +26,7 @@ LINES = [
 ]
 
 
-def expected(lines: list[dict[str, Any]]) -> list[Value]:
+def expected_values(lines: list[dict[str, Any]]) -> list[Value]:
     return sorted(
         (line["step"], f"{line['part']}/{name}", float(np.float32(value)))
         for line in lines
@@ -94,13 +94,13 @@ READERS: dict[str, Callable[[Path], list[Value]]] = {
 
 @pytest.fixture
 def offline(monkeypatch):
-    """Remove the user's logging variables, set a token, and allow connections only to this machine."""
+    """Remove environment variables of the loggers, set a token, and allow connections only to this machine."""
     for name in ("WANDB_MODE", "WANDB_PROJECT", "TRACKIO_DIR", "TRACKIO_SPACE_ID", "TRACKIO_SERVER_URL"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HF_TOKEN", "hf_of_a_test")
     connect, hosts = socket.socket.connect, []
 
-    def refuse(self: socket.socket, address: Any) -> None:
+    def connect_locally(self: socket.socket, address: Any) -> None:
         if self.family != socket.AF_UNIX and address[0] not in ("127.0.0.1", "::1"):
             hosts.append(address[0])
             raise OSError(f"{address}: no network in tests")
@@ -110,7 +110,7 @@ def offline(monkeypatch):
     monkeypatch.setattr(
         socket, "getaddrinfo", lambda host, *more, **named: hosts.append(host) or resolve("127.0.0.1", *more, **named)
     )
-    monkeypatch.setattr(socket.socket, "connect", refuse)
+    monkeypatch.setattr(socket.socket, "connect", connect_locally)
     yield
     assert not hosts
 
@@ -122,7 +122,7 @@ def unload_library(library: str) -> None:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_loggers_of_a_resumed_run_have_every_line_once(tmp_path, name, offline, capfd):
+def test_loggers_of_a_resumed_run_store_each_line_exactly_once(tmp_path, name, offline, capfd):
     pytest.importorskip("tensorboardX" if name == "tensorboard" else name)
     unload_library("trackio")
     run = tmp_path / "ad-run"
@@ -132,18 +132,19 @@ def test_loggers_of_a_resumed_run_have_every_line_once(tmp_path, name, offline, 
     with pytest.raises(KeyboardInterrupt), open_loggers([name, "json"], metrics, {"train": {"seed": 0}}) as loggers:
         write_lines(loggers, LINES)
         raise KeyboardInterrupt
-    assert READERS[name](run) == expected(LINES)
-    metrics.write_text("".join(json.dumps(line) + "\n" for line in LINES[:1]))  # lines before the checkpoint of step 2
+    assert READERS[name](run) == expected_values(LINES)
+    # The checkpoint of step 2 is after the first line.
+    metrics.write_text("".join(json.dumps(line) + "\n" for line in LINES[:1]))
     more = [*LINES[1:], {"step": 6, "part": "train", "loss": 1.0}]
     with open_loggers([name, name], metrics, {"train": {"seed": 0}}) as loggers:
         write_lines(loggers, more)
-    assert READERS[name](run) == expected([LINES[0], *more])
+    assert READERS[name](run) == expected_values([LINES[0], *more])
     assert {path.name for path in run.iterdir()} == {"metrics.jsonl", name}
     assert capfd.readouterr().out == ""
 
 
 def log_two_runs(folder: Path) -> None:
-    """Write two runs with trackio in this process."""
+    """Log two runs with trackio in this process."""
     pytest.importorskip("trackio")
     unload_library("trackio")
     for run in ("one", "two"):
@@ -156,7 +157,7 @@ def log_two_runs(folder: Path) -> None:
 def test_second_trackio_folder_in_a_process_raises_error(tmp_path, offline):
     with pytest.raises(OptionError, match=r"as long as this process runs, expected .*two.*: train in another process"):
         log_two_runs(tmp_path)
-    assert trackio_values(tmp_path / "one") == expected(LINES)
+    assert trackio_values(tmp_path / "one") == expected_values(LINES)
 
 
 def test_variable_trackio_dir_sets_the_folder_of_all_runs(tmp_path, offline, monkeypatch):

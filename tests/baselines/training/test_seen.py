@@ -15,7 +15,7 @@ from icrl4aht_data.errors import NotStoredError, OptionError
 
 @pytest.fixture
 def dataset(two_sources) -> Dataset:
-    """Return the noise histories of demo_wide in split train, with two teammates."""
+    """Return the histories of source `noise` on demo_wide in split `train`, with two teammates."""
     return load_icrl4aht(two_sources[0], split="train", layout="demo_wide", source="noise")
 
 
@@ -40,10 +40,10 @@ def test_teammate_id_depends_only_on_the_policy():
 
 
 def test_teammate_ids_are_none_for_releases_without_tasks(dataset, monkeypatch):
-    def recover(history_id):
+    def raise_not_stored(history_id):
         raise NotStoredError("no tasks")
 
-    monkeypatch.setattr(dataset, "recover_teammate", recover)
+    monkeypatch.setattr(dataset, "recover_teammate", raise_not_stored)
     assert teammate_ids(dataset, dataset.ids.tolist()) is None
 
 

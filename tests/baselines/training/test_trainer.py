@@ -34,7 +34,7 @@ from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, Option
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
 from tests.helpers.spoiled import read_lines
-from tests.helpers.tiny import start
+from tests.helpers.tiny import start_python
 from tests.helpers.two_sources import two_source_release
 from tests.helpers.xla_flags import add_xla_flag
 
@@ -44,7 +44,7 @@ OPTIONS = TrainOptions(
 MODEL = dataclasses.replace(TINY, layers=1)
 
 
-class Rows:
+class TinySampler:
     """A sampler of batches with flat observations; a batch depends only on its number."""
 
     def __init__(self, seed: int = 0, die_at: int | None = None) -> None:
@@ -66,7 +66,7 @@ def shared_trainer() -> Trainer:
 
 
 def train_tiny(folder: Path, die_at: int | None = None, changes: Any = None, **options: Any) -> TrainState:
-    data = TrainingData(Rows(0, die_at), {"held out": Rows(1)})
+    data = TrainingData(TinySampler(0, die_at), {"held out": TinySampler(1)})
     settings = dataclasses.replace(OPTIONS, **(changes or {}))
     return TrainingTask(shared_trainer().method, data, settings, {}, shared_trainer()).train(folder, **options)
 
@@ -85,7 +85,7 @@ def assert_same(one: Any, two: Any) -> None:
 class TestResume:
     def test_killed_training_resumes_bit_for_bit(self, full_run, tmp_path):
         with pytest.raises(KeyboardInterrupt):
-            # The training run dies after the checkpoint of step 3 and the logged line of step 4.
+            # The run is killed after the checkpoint of step 3 and the logged line of step 4.
             train_tiny(tmp_path, die_at=5, log_to=["tensorboard"])
         assert Checkpoints(tmp_path / CHECKPOINTS).latest == 3
         with (tmp_path / "metrics.jsonl").open("a") as log:
@@ -168,13 +168,13 @@ class TestStopping:
         finally:
             signal.signal(signal.SIGINT, found)
 
-    def test_stop_signals_changes_no_handler_outside_the_main_thread(self):
-        def other_thread() -> Any:
+    def test_signal_handlers_are_unchanged_outside_the_main_thread(self):
+        def handler_in_other_thread() -> Any:
             with stop_signals():
                 return signal.getsignal(signal.SIGINT)
 
         with ThreadPoolExecutor(1) as pool:
-            assert pool.submit(other_thread).result() is signal.getsignal(signal.SIGINT)
+            assert pool.submit(handler_in_other_thread).result() is signal.getsignal(signal.SIGINT)
 
     def test_processes_agree_on_saving_and_stopping(self, monkeypatch):
         def decision(*every_process: tuple[int, int]) -> tuple[bool, int]:
@@ -213,7 +213,7 @@ class TestStep:
         """Accumulating over parts with unequal padding gives the gradient of the complete batch."""
         method = get_method("ad")(dataclasses.replace(MODEL, dropout=0.0), FLAT)
         one, parts = (Trainer(method, dataclasses.replace(OPTIONS, accumulate=n)) for n in (1, 2))
-        batch = Rows().batch(0)
+        batch = TinySampler().batch(0)
         batch = batch._replace(attention_mask=np.arange(7) < np.array([7, 2, 5, 7])[:, None])
         params = random_parameters(method)
 
@@ -238,14 +238,16 @@ class TestStep:
 
 
 @pytest.fixture(scope="module")
-def long_ppo(tmp_path_factory) -> Path:
+def long_ppo_release(tmp_path_factory) -> Path:
     """Return a release with PPO histories of 7 episodes and noise histories of 6 episodes."""
     root = tmp_path_factory.mktemp("releases") / "both"
     two_source_release(root, ppo_episodes=7)
     return root
 
 
-def job(root: Path | None, method: str = "ad", layout: str = "demo_wide", context: int = 7, **choice: Any) -> Any:
+def training_job(
+    root: Path | None, method: str = "ad", layout: str = "demo_wide", context: int = 7, **choice: Any
+) -> Any:
     """Return a training job on histories of a release; `root=None` selects the bundled release."""
     options = dataclasses.replace(OPTIONS, context=context)
     return prepare(method, MODEL, options, HistoryOptions((layout,), root and str(root), **choice))
@@ -268,19 +270,21 @@ class TestHeldOut:
         again = hold_out(dataset.select(dataset.ids[::-1].copy()), 0.25)
         assert set(again.train.ids) == set(split.train.ids)
 
-    def test_split_validation_is_the_part_with_held_out_teammates(self, two_sources):
-        about = job(two_sources[0]).about
+    def test_validation_split_is_used_as_the_data_of_held_out_teammates(self, two_sources):
+        about = training_job(two_sources[0]).about
         assert about["histories"]["sizes"] == {"train": 13, "histories": 1, "teammates": 6}
         assert about["histories"]["teammates_split"] == "validation"
         assert {cell["split"] for cell in about["trained_on"]} == {"train"}
         assert {cell["source"] for cell in about["trained_on"]} == {"ppo", "noise"}
-        learned = job(two_sources[0], source=("ppo",)).about  # the release has no PPO histories in split validation
+        # The release has no PPO histories in split validation.
+        learned = training_job(two_sources[0], source=("ppo",)).about
         assert learned["histories"]["sizes"] == {"train": 3, "histories": 1, "teammates": 4}
         assert learned["histories"]["teammates_split"] == "train"
 
     def test_tasks_with_one_history_are_not_held_out(self, two_sources):
         dataset = load_icrl4aht(two_sources[0], source="ppo", layout="demo_wide")
-        split: Any = hold_out(dataset[3:8], validation=dataset[:1])  # tasks of one history and of four histories
+        # The selection has a task with one history and a task with four histories.
+        split: Any = hold_out(dataset[3:8], validation=dataset[:1])
         assert split.train.ids.tolist()[0] == dataset.ids[3]
         assert (len(split.train), len(split.histories)) == (4, 1)
         assert hold_out(dataset[3:5]).histories is None
@@ -296,18 +300,18 @@ class TestHeldOut:
             ("ad", None, None),
             ("amago_offline", None, None),
         ):
-            found = job(two_sources[0], method, labels=given)
+            found = training_job(two_sources[0], method, labels=given)
             assert found.about["histories"]["labels"] == labels
             assert {cell["labels"] for cell in found.about["trained_on"]} == {labels}
             assert {sampler.labels for sampler in (found.data.train, *found.data.validation.values())} == {labels}
 
-    def test_samplers_use_options_every_and_queries(self, two_sources):
-        found = job(two_sources[0], context=40, every=3)
+    def test_samplers_use_the_options_every_and_queries(self, two_sources):
+        found = training_job(two_sources[0], context=40, every=3)
         assert {sampler.every for sampler in (found.data.train, *found.data.validation.values())} == {3}
-        dpt = job(two_sources[0], "dpt", context=40, queries=3)
+        dpt = training_job(two_sources[0], "dpt", context=40, queries=3)
         assert dpt.data.train[0].query_target.shape == (OPTIONS.batch_size, 3)
 
-    def test_only_teammate_of_the_data_is_not_held_out(self):
+    def test_a_single_teammate_is_not_held_out(self):
         dataset = load_icrl4aht(layout="asymm_both_plain")
         dataset = dataset.filter(task_id=dataset.entries[0].task_id)[:5]
         split: Any = hold_out(dataset)
@@ -316,16 +320,17 @@ class TestHeldOut:
 
     def test_filters_select_histories_and_are_recorded(self):
         """Filter histories of demo_simple by the teammate's family and algorithm and by source."""
-        everything = job(None, layout="demo_simple").about["trained_on"]
-        learned = job(None, layout="demo_simple", teammate_family=("rl",)).about
+        everything = training_job(None, layout="demo_simple").about["trained_on"]
+        learned = training_job(None, layout="demo_simple", teammate_family=("rl",)).about
         assert {cell["family"] for cell in everything} == {"rl", "H1", "H2", "H3", "H4"}
         assert {cell["family"] for cell in learned["trained_on"]} == {"rl"}
         assert learned["histories"]["teammate_family"] == ("rl",)
         one = load_icrl4aht(layout="demo_simple", teammate_family="rl").entries[0].teammate_kind
-        (cell,) = job(None, layout="demo_simple", algorithm=(one,), source=("ppo",)).about["trained_on"]
+        (cell,) = training_job(None, layout="demo_simple", algorithm=(one,), source=("ppo",)).about["trained_on"]
         names = {"layout": "demo_simple", "split": "train", "family": "rl", "algorithm": one, "source": "ppo"}
         assert cell.items() >= names.items()
-        assert cell["histories"] < len(load_icrl4aht(layout="demo_simple", teammate_kind=one))  # some are held out
+        # Some histories are held out.
+        assert cell["histories"] < len(load_icrl4aht(layout="demo_simple", teammate_kind=one))
 
     @pytest.mark.parametrize(
         ("filters", "message"),
@@ -343,7 +348,7 @@ class TestHeldOut:
     )
     def test_filters_that_match_no_history_raise_error(self, filters, message):
         with pytest.raises(EmptySelectionError, match=message):
-            job(None, layout="asymm_both", **filters)
+            training_job(None, layout="asymm_both", **filters)
 
     @pytest.mark.parametrize(
         ("method", "context", "choice", "message"),
@@ -355,14 +360,16 @@ class TestHeldOut:
             ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
         ],
     )
-    def test_training_options_that_do_not_fit_the_data_raise_errors(self, long_ppo, method, context, choice, message):
+    def test_training_options_that_do_not_fit_the_data_raise_errors(
+        self, long_ppo_release, method, context, choice, message
+    ):
         with pytest.raises(OptionError, match=message):
-            job(long_ppo, method, context=context, **choice)
+            training_job(long_ppo_release, method, context=context, **choice)
 
     def test_dpt_training_without_labels_raises_error(self, tmp_path):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
         with pytest.raises(LabelsMissingError, match=r"have no expert actions.*: use labels that all have"):
-            job(tmp_path / "r", "dpt")
+            training_job(tmp_path / "r", "dpt")
 
 
 DEVICES = """
@@ -424,7 +431,7 @@ def check_two_devices(
     log: list[dict[str, Any]], root: Path, folder: Path, environments: list[dict[str, str]], *arguments: str
 ) -> list[str]:
     """Train in a process for each dict of environment variables, check the log, and return each process's output."""
-    processes = [start("-c", DEVICES, str(root), str(folder), *arguments, **one) for one in environments]
+    processes = [start_python("-c", DEVICES, str(root), str(folder), *arguments, **one) for one in environments]
     outputs = [process.communicate(timeout=240) for process in processes]
     for process, (_, error) in zip(processes, outputs, strict=True):
         assert process.returncode == 0, error
@@ -445,7 +452,7 @@ def test_two_devices_give_the_log_of_one_device(lite, tmp_path, one_device_log):
 @pytest.mark.slow
 def test_two_processes_stop_together_and_give_the_log_of_one_device(lite, tmp_path, one_device_log):
     """After a SIGTERM to process 1, both processes save a checkpoint; the same call resumes training."""
-    with socket.socket() as held:  # keeps the port free for JAX's coordinator, which can share it
+    with socket.socket() as held:  # reserves a port that JAX's coordinator can share
         held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         held.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{held.getsockname()[1]}"

@@ -26,7 +26,7 @@ from icrl4aht_generation.learners.resume import StateFile
 from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases.check import compare_rebuilds
 
-from tests.helpers.tiny import TINY, artefact, start
+from tests.helpers.tiny import TINY, artefact, start_python
 from tests.robustness.limits import file_size_limit
 
 COLLECT = """
@@ -72,7 +72,7 @@ def test_collection_killed_at_random_times_writes_the_same_artefact(built, tmp_p
     for _ in range(2):
         updates, then = int(random.integers(2, 5)), float(random.uniform(0, 0.1))
         killed.append(f"after {updates} updates and {then:.3f} s")
-        process = start(*command)
+        process = start_python(*command)
         assert process.stdout is not None
         printed = [process.stdout.readline() for _ in range(updates)]
         time.sleep(then)
@@ -81,7 +81,7 @@ def test_collection_killed_at_random_times_writes_the_same_artefact(built, tmp_p
         assert process.returncode == -9, errors
         assert not folder.exists(), killed
         firsts.append(int(printed[0]))
-    output, errors = start(*command).communicate()
+    output, errors = start_python(*command).communicate()
     assert folder.exists(), errors
     firsts.append(int(output.split()[0]))
     assert firsts[0] == 1

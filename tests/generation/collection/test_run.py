@@ -24,7 +24,7 @@ from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import OptionError
 from tests.helpers.commands import run_cli
 from tests.helpers.jobs import FileJob
-from tests.helpers.tiny import PAIR, artefact, start
+from tests.helpers.tiny import PAIR, artefact, start_python
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_rebuild_with_an_unfinished_task_writes_no_release(profile, unfinished, 
 @pytest.mark.slow
 def test_two_generate_commands_at_once_collect_a_task_once(built, tmp_path):
     command = ["-m", "icrl4aht_data", "generate", "--profile", str(built / "tiny.toml"), "--out", str(tmp_path)]
-    processes = [start(*command) for _ in range(2)]
+    processes = [start_python(*command) for _ in range(2)]
     outputs = [process.communicate() for process in processes]
     assert [process.returncode for process in processes] == [0, 0], outputs
     timing = (artefact(tmp_path) / "timing.jsonl").read_text().splitlines()
@@ -94,7 +94,7 @@ def test_ray_workers_collect_bit_equal_tasks(profile, unfinished, built, tmp_pat
     damaged task is also collected. Meanwhile, no process listens on addresses other than the loopback."""
     command = ["-m", "icrl4aht_data", "generate", "--profile", str(profile), "--out", str(tmp_path)]
     addresses: set[str] = set()
-    process = start(*command, "--executor", "ray", "--workers", "2", "--retries", "1")
+    process = start_python(*command, "--executor", "ray", "--workers", "2", "--retries", "1")
     while process.poll() is None:
         addresses |= listening_addresses(psutil.Process(process.pid))
         time.sleep(0.5)  # listing all connections takes much CPU time

@@ -42,12 +42,12 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import file_hash
 from tests.helpers.damages import flip_bit
-from tests.helpers.tiny import start
+from tests.helpers.tiny import start_python
 from tests.helpers.xla_flags import add_xla_flag
 
 LAYOUT = get_layout("cramped_up")
 SMOKE = load_profile("smoke").teammates
-EACH_KIND = pytest.mark.parametrize("algorithm", ["lbrdiv", pytest.param("comedi", marks=pytest.mark.slow)])
+EACH_KIND = pytest.mark.parametrize("algorithm", ["lbrdiv", "comedi"])
 """LBRDiv trains pairs of policies, CoMeDi trains in stages; `test_generate.py` trains FCP and BRDiv."""
 CONFIG, WIDTHS = replace(SMOKE.ppo, epochs=1), SMOKE.ppo.widths
 
@@ -112,6 +112,7 @@ def weight_hashes(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): file_hash(path) for path in sorted(folder.rglob(POLICY_WEIGHTS))}
 
 
+@pytest.mark.slow
 @EACH_KIND
 def test_population_has_five_checkpoints_of_each_member(trained, algorithm):
     found = list(suite_checkpoints(trained(algorithm), LAYOUT.name, algorithm))
@@ -126,6 +127,7 @@ def test_population_has_five_checkpoints_of_each_member(trained, algorithm):
     assert not list(folder.glob("resume*"))
 
 
+@pytest.mark.slow
 @EACH_KIND
 def test_cards_describe_checkpoints_of_a_population(trained, algorithm):
     for number, point in enumerate(suite_checkpoints(trained(algorithm), LAYOUT.name, algorithm)):
@@ -142,6 +144,7 @@ def test_cards_describe_checkpoints_of_a_population(trained, algorithm):
         assert card["code_version"]
 
 
+@pytest.mark.slow
 def test_returns_on_cards_are_those_of_the_checkpoints(trained):
     """Evaluate the last checkpoints with their best responses again and compare with the stored returns."""
     folder = population(trained("lbrdiv"), "lbrdiv")
@@ -153,6 +156,7 @@ def test_returns_on_cards_are_those_of_the_checkpoints(trained):
         assert [card[name] for _, _, card in loaded] == returns.tolist()
 
 
+@pytest.mark.slow
 @EACH_KIND
 def test_population_log_has_a_line_for_each_update(trained, algorithm):
     folder = population(trained(algorithm), algorithm)
@@ -211,6 +215,7 @@ def test_second_training_in_a_locked_folder_raises_error(tmp_path):
         job_of("fcp", tmp_path).run()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [f"m0/c0/{POLICY_WEIGHTS}", f"m1/c4/{POLICY_CARD}", f"responses/m1/{POLICY_WEIGHTS}"])
 def test_population_with_changed_or_missing_file_is_unfinished(trained, tmp_path, name):
     folder, job = population(tmp_path, "lbrdiv"), job_of("lbrdiv", tmp_path)
@@ -233,7 +238,7 @@ def test_population_on_two_devices_learns_the_same_policies(tmp_path):
     (stage,) = run_of("fcp").stages
     state, _ = jax.jit(stage.update)(jax.jit(stage.init)(jax.random.fold_in(jax.random.key(0), 0)))
     flags = add_xla_flag("--xla_force_host_platform_device_count=2")
-    process = start("-c", TWO_DEVICES, str(tmp_path / "weights.npz"), XLA_FLAGS=flags)
+    process = start_python("-c", TWO_DEVICES, str(tmp_path / "weights.npz"), XLA_FLAGS=flags)
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
     found = np.load(tmp_path / "weights.npz")

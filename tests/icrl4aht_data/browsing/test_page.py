@@ -28,7 +28,7 @@ from icrl4aht_data.overcooked.drawing import Canvas, state_parts
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.writing.convert import to_release
-from tests.helpers.browser_pages import embedded, episodes
+from tests.helpers.browser_pages import embedded_data, embedded_episodes
 from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import random_release
 from tests.helpers.states import random_records
@@ -49,16 +49,16 @@ def run_browse(*arguments: object, code: int = 0) -> str:
 
 def assert_page_embeds(page: bytes, dataset, shown: int | None = None) -> None:
     """Assert that every frame embedded in a page equals the stored arrays."""
-    index, contents = embedded(page)
+    index, contents = embedded_data(page)
     assert [facts["history_id"] for facts in index["histories"]] == dataset.ids.tolist()
     for facts, content, history in zip(index["histories"], contents, dataset, strict=True):
         returns, ends = history.returns(), np.flatnonzero(history.dones[:]) + 1
         assert facts["returns"] == returns.tolist()
-        decoded = episodes(index, facts, content)
+        decoded = embedded_episodes(index, facts, content)
         assert len(decoded) == (len(ends) if shown is None else min(shown, len(ends)))
         assert {0, len(ends) - 1} <= set(decoded)
         names = {"state", "rewards", "actions", "teammate_actions", "expert_actions"}
-        # The expert of a noise history is the oracle, so the page stores its labels only once.
+        # The expert of a noise history is the oracle, so the page stores one copy of the labels.
         apart = history.entry.has_oracle_actions and history.entry.source != "noise"
         names |= {"oracle_actions"} if apart else set()
         arrays = {name: history.read(name) for name in names}
@@ -84,7 +84,7 @@ def test_embedded_episodes_equal_the_stored_episodes(release):
 
 def test_page_omits_label_columns_of_histories_without_labels(tmp_path):
     random_release(tmp_path / "r", labels=False, teammates=1, streams=1)
-    index, _ = embedded(make_browser_page(load_icrl4aht(tmp_path / "r")).html)
+    index, _ = embedded_data(make_browser_page(load_icrl4aht(tmp_path / "r")).html)
     assert [facts["columns"] for facts in index["histories"]] == [["rewards", "actions", "teammate_actions"]] * 2
 
 
@@ -108,7 +108,7 @@ def test_page_above_the_size_limit_shows_fewer_episodes(release):
     page = make_browser_page(dataset, megabytes=0.9 * size / 1e6)
     assert len(page.html) < 0.9 * size
     assert page.shown_episodes < page.episodes
-    assert_page_embeds(page.html, dataset, shown=len(embedded(page.html)[0]["histories"][0]["shown"]))
+    assert_page_embeds(page.html, dataset, shown=len(embedded_data(page.html)[0]["histories"][0]["shown"]))
     with pytest.raises(OptionError, match=r"first and last episodes of 12 histories, expected less than 0\.05 MB"):
         make_browser_page(dataset, megabytes=0.05)
 
@@ -167,12 +167,12 @@ class TestBrowseCommand:
             "shown_episodes": 32,
             "bytes": out.stat().st_size,
         }
-        assert [facts["layout"] for facts in embedded(out.read_bytes())[0]["histories"]].count("demo_wide") == 2
+        assert [facts["layout"] for facts in embedded_data(out.read_bytes())[0]["histories"]].count("demo_wide") == 2
 
     def test_history_option_selects_histories_in_the_given_order(self, release, tmp_path):
         out = tmp_path / "page.html"
         run_browse(release, "--out", out, "--history", 5, "--history", 2, "--history", 5, "-q")
-        assert [facts["history_id"] for facts in embedded(out.read_bytes())[0]["histories"]] == [5, 2]
+        assert [facts["history_id"] for facts in embedded_data(out.read_bytes())[0]["histories"]] == [5, 2]
         with pytest.raises(UnknownNameError, match="99"):
             run_browse(release, "--out", tmp_path / "other.html", "--history", 99)
 

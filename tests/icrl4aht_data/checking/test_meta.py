@@ -15,7 +15,7 @@ from icrl4aht_data.format.provenance import read_provenance
 from icrl4aht_data.format.schema import HISTORIES, INFO, PROVENANCE
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.random_releases import SHARD
-from tests.helpers.spoiled import first_value, problems, spoiled
+from tests.helpers.spoiled import first_value, problems, spoiled_copy
 from tests.robustness.limits import time_limit
 
 
@@ -75,23 +75,25 @@ def test_verify_finds_false_values_in_meta_files(release, tmp_path, name, change
     assert note.ego is not None
     environments = note.ego["environments"]
     message = message.format(recorded=note.streams_recorded, environments=environments, total=2 * environments)
-    found = problems(spoiled(release, tmp_path / "release", name, change), "quick")
+    found = problems(spoiled_copy(release, tmp_path / "release", name, change), "quick")
     assert any(message in problem for problem in found), found
 
 
 def test_teammate_field_in_provenance_is_refused(release, tmp_path):
     """Regression: a teammate in provenance.json once replaced the teammate stored with the task."""
-    root = spoiled(release, tmp_path / "r", PROVENANCE, lambda c: first_value(c)["teammate"].update(family="brdiv"))
+    root = spoiled_copy(
+        release, tmp_path / "r", PROVENANCE, lambda c: first_value(c)["teammate"].update(family="brdiv")
+    )
     with pytest.raises(IndexFormatError, match="unknown field `family`"):
         load_icrl4aht(root).recover_teammate(0)
 
 
 def test_verify_finds_false_values_in_a_release_without_tasks(converted_release, tmp_path):
-    def change(lines: list) -> None:
+    def make_lines_false(lines: list) -> None:
         lines[1].update(seed=3)
         lines[0].update(task_id=lines[-1]["task_id"])
 
-    found = "\n".join(problems(spoiled(converted_release, tmp_path / "r", HISTORIES, change), "quick"))
+    found = "\n".join(problems(spoiled_copy(converted_release, tmp_path / "r", HISTORIES, make_lines_false), "quick"))
     assert "history 1: seed: expected -1 without tasks, found 3" in found
     assert "of one task differ in" in found
 
@@ -109,18 +111,18 @@ def test_verify_finds_unreferenced_shards_and_policies(release, tmp_path):
 
 
 @pytest.mark.parametrize("with_info", [True, False])
-def test_verify_reports_a_terabyte_shard_within_20_seconds(damaged, with_info):
-    os.truncate(damaged / SHARD, 10**12)
+def test_verify_reports_a_terabyte_shard_within_20_seconds(release_copy, with_info):
+    os.truncate(release_copy / SHARD, 10**12)
     if not with_info:
-        (damaged / INFO).unlink()
+        (release_copy / INFO).unlink()
     for level in ("quick", "full", "deep"):
         with time_limit(20):
-            found = problems(damaged, level)
+            found = problems(release_copy, level)
             assert any("bytes, found 1,000,000,000,000" in problem for problem in found)
             assert sum("bytes, found" in problem for problem in found) == 1, found
 
 
-def test_verify_reports_a_terabyte_readme(damaged):
-    os.truncate(damaged / "README.md", 10**12)
-    found = problems(damaged, "quick")
+def test_verify_reports_a_terabyte_readme(release_copy):
+    os.truncate(release_copy / "README.md", 10**12)
+    found = problems(release_copy, "quick")
     assert any("README.md: expected at most 4,294,967,296 bytes, found 1,000,000,000,000" in line for line in found)

@@ -13,7 +13,7 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.commands import run_cli
 from tests.helpers.published_files import KEPT
 from tests.helpers.random_releases import make_tasks
-from tests.helpers.spoiled import problems, spoiled
+from tests.helpers.spoiled import problems, spoiled_copy
 
 
 class TestVerifyObservations:
@@ -36,16 +36,16 @@ class TestVerifyObservations:
         assert found.endswith("obs: 1 steps do not show demo_wide from any cell of the ego's, first step 33")
 
     def test_verify_finds_wrong_scores_and_episode_counts_in_the_index(self, converted_release, tmp_path):
-        def change(lines: list) -> None:
+        def make_lines_false(lines: list) -> None:
             lines[0].update(score=lines[0]["score"] + 1)
             lines[1].update(episodes=5)
 
-        found = problems(spoiled(converted_release, tmp_path / "r", HISTORIES, change))
+        found = problems(spoiled_copy(converted_release, tmp_path / "r", HISTORIES, make_lines_false))
         assert any("history 0: score: the index says" in line for line in found), found
         assert any("history 1: dones: expected 5 episodes of 20 steps, found 6" in line for line in found), found
 
 
-def test_convert_accepts_observations_except_for_forms_that_need_states(published_folder, tmp_path):
+def test_observations_cannot_be_converted_to_forms_that_need_states(published_folder, tmp_path):
     out = tmp_path / "out"
     said = run_cli("convert", published_folder[0], "--out", out, "--kept-steps", KEPT)
     assert said == f"{out}: observations, no state records: nothing can be replayed or drawn\n"

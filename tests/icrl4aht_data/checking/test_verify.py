@@ -60,21 +60,21 @@ def test_verify_finds_every_flipped_bit(converted_release, tmp_path, release, fl
     assert verify_release(root).ok
 
 
-def test_verify_lists_missing_and_extra_files(damaged):
-    (damaged / "meta" / "provenance.json").unlink()
-    (damaged / "data" / "notes.txt").write_text("hello")
-    assert problems(damaged) == [
+def test_verify_lists_missing_and_extra_files(release_copy):
+    (release_copy / "meta" / "provenance.json").unlink()
+    (release_copy / "data" / "notes.txt").write_text("hello")
+    assert problems(release_copy) == [
         "meta/provenance.json: listed in the manifest, but missing",
         "data/notes.txt: not listed in the manifest",
     ]
 
 
 @pytest.mark.parametrize("name", ["meta/info.json", HISTORIES, "meta/tasks.jsonl", "meta/provenance.json"])
-def test_quick_verification_checks_the_checksums_of_meta_files(damaged, name):
+def test_quick_verification_checks_the_checksums_of_meta_files(release_copy, name):
     """Append a space to a file of meta/; only its checksum reveals the change."""
-    path = damaged / name
+    path = release_copy / name
     path.write_text(path.read_text() + " ")
-    assert name in verify_release(damaged, level="quick").files_at_fault
+    assert name in verify_release(release_copy, level="quick").files_at_fault
 
 
 def test_verify_finds_weights_that_do_not_match_their_folder_name(tmp_path):
@@ -104,12 +104,12 @@ def test_verify_finds_expert_returns_that_differ_from_provenance(tmp_path):
 
 
 def change_value(name, index, value):
-    def change(arrays):
+    def copy_with_value(arrays):
         changed = arrays[name].copy()
         changed[index] = value(changed[index]) if callable(value) else value
         return arrays | {name: changed}
 
-    return change
+    return copy_with_value
 
 
 @pytest.mark.parametrize(
@@ -166,11 +166,11 @@ def test_deep_verification_finds_observations_that_differ_from_the_state(tmp_pat
     assert found.endswith("obs: 1 steps differ from what their state shows, first step 17")
 
 
-def test_verify_finds_the_chunk_table_of_another_shard(damaged):
-    random_release(damaged.with_name("other"), streams=2)
-    shutil.copy(damaged.with_name("other") / chunk_table_name(SHARD), damaged / chunk_table_name(SHARD))
-    write_manifest(damaged)
-    assert any("the index implies 42 chunks, the chunk table has 28" in line for line in problems(damaged))
+def test_verify_finds_the_chunk_table_of_another_shard(release_copy):
+    random_release(release_copy.with_name("other"), streams=2)
+    shutil.copy(release_copy.with_name("other") / chunk_table_name(SHARD), release_copy / chunk_table_name(SHARD))
+    write_manifest(release_copy)
+    assert any("the index implies 42 chunks, the chunk table has 28" in line for line in problems(release_copy))
 
 
 @pytest.mark.parametrize(
@@ -184,9 +184,9 @@ def test_verify_finds_the_chunk_table_of_another_shard(damaged):
         (lambda lines: lines[0].update(split="test"), "line 1: shard"),
     ],
 )
-def test_verify_finds_false_index_lines(damaged, change, message):
-    spoil(damaged, HISTORIES, change)
-    assert any(message in problem for problem in problems(damaged)), problems(damaged)
+def test_verify_finds_false_index_lines(release_copy, change, message):
+    spoil(release_copy, HISTORIES, change)
+    assert any(message in problem for problem in problems(release_copy)), problems(release_copy)
 
 
 def test_verify_finds_a_shard_without_index_lines(tmp_path):
@@ -198,9 +198,9 @@ def test_verify_finds_a_shard_without_index_lines(tmp_path):
     assert any("00001-of-00002.h5: the name of" in problem for problem in found), found
 
 
-def test_verify_finds_episode_lengths_that_differ_from_info(damaged):
-    spoil(damaged, INFO, lambda content: content["environment"].update(kept_steps=40))
-    assert any("expected 6 episodes of 40 steps, found 6 in 120 steps" in p for p in problems(damaged))
+def test_verify_finds_episode_lengths_that_differ_from_info(release_copy):
+    spoil(release_copy, INFO, lambda content: content["environment"].update(kept_steps=40))
+    assert any("expected 6 episodes of 40 steps, found 6 in 120 steps" in p for p in problems(release_copy))
 
 
 def test_verify_never_raises_on_damaged_files(tmp_path):
@@ -223,20 +223,20 @@ def test_verify_never_raises_on_damaged_files(tmp_path):
     assert verify_release(root, level="deep").ok
 
 
-def test_verify_finds_chunk_offsets_beyond_the_end_of_the_shard(damaged):
-    table = np.load(damaged / chunk_table_name(SHARD))
+def test_verify_finds_chunk_offsets_beyond_the_end_of_the_shard(release_copy):
+    table = np.load(release_copy / chunk_table_name(SHARD))
     table["offset"][3] = 2**63 + 5
-    np.save(damaged / chunk_table_name(SHARD), table)
-    write_manifest(damaged)
-    assert any("truncated" in problem for problem in problems(damaged))
+    np.save(release_copy / chunk_table_name(SHARD), table)
+    write_manifest(release_copy)
+    assert any("truncated" in problem for problem in problems(release_copy))
 
 
-def test_verify_finds_a_group_in_place_of_a_dataset(damaged):
-    with h5py.File(damaged / SHARD, "r+") as file:
+def test_verify_finds_a_group_in_place_of_a_dataset(release_copy):
+    with h5py.File(release_copy / SHARD, "r+") as file:
         del file["0/actions"]
         file.create_group("0/actions")
-    update_metadata_rows(damaged)
-    assert any("hdf5" in problem.lower() for problem in problems(damaged)), problems(damaged)
+    update_metadata_rows(release_copy)
+    assert any("hdf5" in problem.lower() for problem in problems(release_copy)), problems(release_copy)
 
 
 def update_metadata_rows(root):
@@ -249,9 +249,9 @@ def update_metadata_rows(root):
 
 
 @pytest.mark.parametrize("heap", ["local", "global"])
-def test_verify_terminates_on_a_shard_with_a_cyclic_heap(damaged, heap):
+def test_verify_terminates_on_a_shard_with_a_cyclic_heap(release_copy, heap):
     """Regression: libhdf5 loops forever on a free list or heap object that points to itself."""
-    path = damaged / SHARD
+    path = release_copy / SHARD
     if heap == "local":
         with h5py.File(path, "r+", libver="earliest") as file:
             file.create_group("old").create_group("group")
@@ -263,8 +263,8 @@ def test_verify_terminates_on_a_shard_with_a_cyclic_heap(damaged, heap):
     else:
         struct.pack_into("<HHIQ", data, at + 16, 0, 0, 0, 0)
     path.write_bytes(data)
-    update_metadata_rows(damaged)
-    command = [sys.executable, "-m", "icrl4aht_data", "verify", str(damaged)]
+    update_metadata_rows(release_copy)
+    command = [sys.executable, "-m", "icrl4aht_data", "verify", str(release_copy)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert ("expected no local heap" in done.stdout) == (heap == "local"), done
 
@@ -274,10 +274,10 @@ class TestVerifyCommand:
         printed = run_cli("verify", "--deep", lite[0])
         assert "valid; checked 9 files, 84 chunks, 12 histories, 1,440 transitions and their physics" in printed
 
-    def test_verify_command_names_the_damaged_chunk(self, damaged):
-        flip_bit(damaged / SHARD, int(np.load(damaged / chunk_table_name(SHARD))["offset"][0]))
-        assert "chunk 0 of state in history 0" in run_cli("verify", damaged, code=1)
-        content = json.loads(run_cli("verify", "--json", damaged, code=1))
+    def test_verify_command_names_the_damaged_chunk(self, release_copy):
+        flip_bit(release_copy / SHARD, int(np.load(release_copy / chunk_table_name(SHARD))["offset"][0]))
+        assert "chunk 0 of state in history 0" in run_cli("verify", release_copy, code=1)
+        content = json.loads(run_cli("verify", "--json", release_copy, code=1))
         assert not content["ok"]
         assert {finding["file"] for finding in content["findings"]} == {SHARD}
 

@@ -128,8 +128,8 @@ def test_commands_do_not_overwrite_existing_data(lite, full, tmp_path):
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     ca, cb, mine = (str(tmp_path / name) for name in ("ca", "cb", "mine"))
     commands = [
-        ("combine", ca, cb),  # regression: this command once replaced `ca`
-        ("release", "build", ca, cb),  # regression: this command once replaced `cb`
+        ("combine", ca, cb),  # regression: this command once overwrote the release `ca`
+        ("release", "build", ca, cb),  # regression: this command once overwrote the release `cb`
         ("convert", ca, cb, "--to", "full"),
         *(("combine", ca, "--out", target, *more) for target in (ca, cb, mine) for more in ((), ("--overwrite",))),
         *(("release", "build", ca, "--out", target) for target in (ca, cb, mine)),

@@ -1,4 +1,4 @@
-"""Test that cached arrays are rebuilt on any mismatch and limited in size, and that errors name a remedy."""
+"""Test that cached arrays are rebuilt on any mismatch and limited in size, and that errors say what to do."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from icrl4aht_data.errors import CacheError, OptionError
 from icrl4aht_data.format import cached_arrays as module
 from icrl4aht_data.format.cached_arrays import cached_arrays, new_mapped_array
-from tests.helpers.damages import DAMAGES, contents, flip_bit
+from tests.helpers.damages import DAMAGES, file_contents, flip_bit
 from tests.robustness.limits import can_mount, enforced_permissions, small_disk
 
 KEY = f"histories-{0:032x}"
@@ -48,12 +48,12 @@ def test_cached_arrays_are_built_only_once(cache_folder):
 @pytest.mark.parametrize("damage", [name for name in DAMAGES if "bit" not in name])
 def test_cached_arrays_with_wrong_sizes_or_headers_are_rebuilt(cache_folder, damage):
     cached_arrays(KEY, SIZE, write_arrays)
-    right = contents(cache_folder / KEY)
+    right = file_contents(cache_folder / KEY)
     assert list(right) == ["a.npy", "b.values.npy", "contents.json"]
     for name in right:
         DAMAGES[damage](cache_folder / KEY / name)
         assert_cached_values(cached_arrays(KEY, SIZE, write_arrays))
-        assert contents(cache_folder / KEY) == right
+        assert file_contents(cache_folder / KEY) == right
         assert [path.name for path in cache_folder.iterdir()] == [KEY]
 
 

@@ -41,19 +41,19 @@ def test_check_chunk_compares_size_crc32_and_hash():
 
 
 @pytest.mark.parametrize("cache", CACHES)
-def test_changed_chunk_with_matching_crc32_is_refused(damaged, tmp_path, monkeypatch, cache):
+def test_changed_chunk_with_matching_crc32_is_refused(release_copy, tmp_path, monkeypatch, cache):
     """Change a chunk, its CRC-32 and the manifest; only the stored BLAKE2b hash reveals the change."""
     # a new cache has no arrays of the undamaged release
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
-    path, data = damaged / chunk_table_name(SHARD), bytearray((damaged / SHARD).read_bytes())
+    path, data = release_copy / chunk_table_name(SHARD), bytearray((release_copy / SHARD).read_bytes())
     table = np.load(path)
     start, end = int(table["offset"][0]), int(table["offset"][0] + table["size"][0])
     data[start + 5] ^= 1
     table["crc32"][0] = zlib.crc32(data[start:end])
-    (damaged / SHARD).write_bytes(data)
+    (release_copy / SHARD).write_bytes(data)
     np.save(path, table)
-    write_manifest(damaged)
+    write_manifest(release_copy)
     with pytest.raises(ShardCorruptError, match=r"chunk 0 of state in history 0 .* expected blake2b"):
-        load_icrl4aht(damaged, layout="coord_simple", cache=cache).ad(batch_size=64, length=9)[0]
-    problems = [finding.problem for finding in verify_release(damaged).findings]
+        load_icrl4aht(release_copy, layout="coord_simple", cache=cache).ad(batch_size=64, length=9)[0]
+    problems = [finding.problem for finding in verify_release(release_copy).findings]
     assert any("chunk 0 of state in history 0" in problem and "blake2b" in problem for problem in problems), problems

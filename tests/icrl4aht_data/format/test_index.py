@@ -12,13 +12,13 @@ import pytest
 from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, UnknownNameError
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.schema import Entry
-from tests.helpers.random_releases import long_index
+from tests.helpers.random_releases import write_long_index
 
 
 @pytest.fixture(scope="module")
 def long_release(tmp_path_factory) -> tuple[Path, list[Entry]]:
     root = tmp_path_factory.mktemp("long") / "release"
-    return root, long_index(root)
+    return root, write_long_index(root)
 
 
 def test_index_entries_equal_the_written_lines(long_release):

@@ -77,7 +77,7 @@ class TestReleaseWithLayouts:
         assert verify_release(root, level="deep").ok
 
     def test_commands_accept_names_of_release_layouts(self, root):
-        """Layout names of a release are known once the release is read; names of package layouts are always known."""
+        """Commands always know the package's layouts, and know the layouts of a release after reading the release."""
         printed = run_cli("list", root, "--layout", "mine-3-5")
         assert "mine-3-5" in printed and "coord_simple" not in printed
         with pytest.raises(UnknownNameError, match="unknown layout 'nowhere'"):
@@ -184,7 +184,7 @@ class TestRecipesOfATask:
         assert verify_release(root, level="deep").ok
         (task,) = read_tasks(root / TASKS)
         plain = dataclasses.replace(task, recipes=None)
-        write_tasks(root / TASKS, [plain])  # the stored id still hashes the removed recipes
+        write_tasks(root / TASKS, [plain])  # the stored task id is still the hash of the task with recipes
         write_manifest(root)
         with pytest.raises(TaskFormatError, match="does not match the task's content"):
             read_tasks(root / TASKS)

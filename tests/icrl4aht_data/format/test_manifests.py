@@ -73,7 +73,9 @@ def test_manifests_check_command_fails_on_a_difference(monkeypatch, tmp_path):
     write_tasks(short, published_tasks("layout")[:-1])
     run_cli("research manifests --check")
     monkeypatch.setattr("icrl4aht_generation.commands.manifest_path", lambda track, split, teammates="": short)
-    monkeypatch.setattr("icrl4aht_generation.teammates.draws.diverse_tasks", lambda track, split: [])  # saves a second
+    monkeypatch.setattr(
+        "icrl4aht_generation.teammates.draws.diverse_tasks", lambda track, split: []
+    )  # drawing these tasks takes a second
     with pytest.raises(TaskFormatError, match="the file's tasks differ from the tasks of this version"):
         run_cli("research manifests --check")
 

@@ -24,7 +24,7 @@ from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
 from icrl4aht_data.writing.release_folder import HISTORIES_INDEX
 from tests.helpers.random_releases import SHARD, one_history_release, random_release
-from tests.helpers.spoiled import first_value, problems, read_lines, spoiled
+from tests.helpers.spoiled import first_value, problems, read_lines, spoiled_copy
 
 SCRIPT = ExpertLabels(None, "the oracle's", return_greedy=40.0, episodes=200)
 SOURCES = ("noise", "ppo", "ppo", "noise")
@@ -33,7 +33,10 @@ OPTIONS: dict[str, Any] = {"streams": 2, "episodes": 5, "oracle": True, "learner
 
 @pytest.fixture(scope="module", params=KINDS)
 def mixed_release(request, tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """Return a release of each kind with PPO and noise histories, two learners and oracle actions (read-only)."""
+    """Return a release with PPO and noise histories, two learners and oracle actions (read-only).
+
+    Tests run once for each kind of release.
+    """
     root = tmp_path_factory.mktemp("mixed") / request.param
     experts = [SCRIPT, None, None, SCRIPT]
     return root, random_release(root, request.param, experts=experts, sources=SOURCES, **OPTIONS)
@@ -54,7 +57,7 @@ def lite_release(tmp_path_factory) -> Path:
             one["nearest_test"] = {"teammate": "H3/t1", "distance": 0.25}
         noise["nearest_test"]["behaviour"] = 3
 
-    return spoiled(root, root.with_name("complete"), PROVENANCE, add_optional_fields)
+    return spoiled_copy(root, root.with_name("complete"), PROVENANCE, add_optional_fields)
 
 
 def test_oracle_actions_learners_and_sources_round_trip(mixed_release):
@@ -132,7 +135,7 @@ def test_published_files_omit_oracle_actions_and_learner_numbers(lite_release, t
     ],
 )
 def test_verify_finds_false_learners_sources_and_provenance(lite_release, tmp_path, name, change, message):
-    found = "\n".join(problems(spoiled(lite_release, tmp_path / "release", name, change), "deep"))
+    found = "\n".join(problems(spoiled_copy(lite_release, tmp_path / "release", name, change), "deep"))
     assert message in found
 
 
@@ -173,14 +176,15 @@ def test_conversions_keep_left_out_tasks(lite_release, tmp_path):
     root = set_left_out(shutil.copytree(lite_release, tmp_path / "a"), LEFT_OUT, other)
     assert verify_release(root, level="deep").ok
     assert load_icrl4aht(root).info.left_out == [LEFT_OUT, other]
-    to_release(load_icrl4aht(root), tmp_path / "out", "full")  # drops tasks on layouts that the release does not have
+    to_release(load_icrl4aht(root), tmp_path / "out", "full")  # the copy lists no left-out tasks on other layouts
     assert read_info(tmp_path / "out").left_out == [other]
     random_release(tmp_path / "b", layouts=("demo_wide",), teammates=1, streams=1)
     made = load_icrl4aht(tmp_path / "b").entries[0].task_id
     set_left_out(tmp_path / "b", other)
     set_left_out(root, LEFT_OUT, other, replace(LEFT_OUT, task_id=made))
     combine_releases(tmp_path / "both", [root, tmp_path / "b"])
-    assert read_info(tmp_path / "both").left_out == [LEFT_OUT, other]  # no duplicates, and no tasks that have histories
+    # `other` is listed once, and the task that has histories in the second release is not listed
+    assert read_info(tmp_path / "both").left_out == [LEFT_OUT, other]
     assert verify_release(tmp_path / "both").ok
 
 

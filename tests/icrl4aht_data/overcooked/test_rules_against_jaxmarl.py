@@ -17,7 +17,7 @@ from tests.helpers.states import random_records
 BATCH, STEPS, SCENES = 512, 20, 20  # 10,240 steps of trajectories, then 10,240 single steps from random states
 
 
-DEFAULT = ("coord_ring",)  # this layout has buttons; all other layouts are slow tests
+DEFAULT = ("coord_ring",)  # this layout has buttons; the other layouts run only among the slow tests
 
 
 @pytest.mark.parametrize(

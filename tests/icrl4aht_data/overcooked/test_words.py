@@ -1,4 +1,4 @@
-"""Test that the words of visible cells stand for the channels that `observe` returns."""
+"""Test words, integers that encode the content of a visible cell, against the channels that `observe` returns."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def test_entries_include_all_nonzero_values_of_observations(layout):
     assert np.isin(seen[0], words.entries((0,))).all()
     assert np.isin(seen[1], words.entries((1,))).all()
     np.testing.assert_array_equal(words.entries((0, 1)), np.union1d(words.entries((0,)), words.entries((1,))))
-    # encoders skip the other entries, which are always zero
+    # model encoders skip the remaining entries of observations, which are always zero
     assert len(words.entries((0,))) < VISIBLE * layout.channels / 2
 
 
 @pytest.mark.parametrize("canonical", [False, True], ids=["own", "canonical"])
 def test_words_of_several_layouts_in_one_batch_equal_observations(canonical):
-    """Use four layouts with equal channels, or canonical channels and all layouts."""
+    """Mix four layouts with equal channels, or all layouts with canonical channels."""
     names = LAYOUTS if canonical else ("asymm_both", "cramped_up", "asymm_right", "cramped_down")
     layouts = tuple(map(get_layout, names))
     words, size = cell_words(layouts, canonical), max(map(record_size, layouts))

@@ -67,23 +67,23 @@ def test_published_release_is_valid_and_contains_the_source_files(release, publi
         assert (published_release / name).read_bytes() == (ROOT / name).read_bytes()
 
 
-def test_build_release_refuses_an_invalid_source(damaged, tmp_path):
-    shard = next(damaged.rglob("*.h5"))
+def test_build_release_refuses_an_invalid_source(release_copy, tmp_path):
+    shard = next(release_copy.rglob("*.h5"))
     shard.write_bytes(shard.read_bytes()[:-1] + b"?")
     with pytest.raises(ReleaseError, match=r"release: not valid: .*\.h5: sha256: expected .*; see `icrl4aht"):
-        build_release(damaged, tmp_path / "out")
+        build_release(release_copy, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     with pytest.raises(OptionError, match="release is also read"):
-        build_release(damaged, damaged)
+        build_release(release_copy, release_copy)
 
 
-def test_changes_during_copying_are_detected(damaged, tmp_path):
+def test_changes_during_copying_are_detected(release_copy, tmp_path):
     def change_copied_file(what, done, total):
         if what == "copying" and done == total:
             (tmp_path / ".out.partial/meta/provenance.json").write_text("{}")
 
     with pytest.raises(ReleaseError, match=r"provenance\.json: changed while it was copied; sha256 is now"):
-        build_release(damaged, tmp_path / "out", advance=change_copied_file)
+        build_release(release_copy, tmp_path / "out", advance=change_copied_file)
     assert not (tmp_path / "out").exists()
 
 

@@ -21,7 +21,7 @@ from icrl4aht_data.utils.templates import card_file, fill_template
 from tests.helpers.commands import run_cli
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import random_release
-from tests.servers.faults import Request, Slow, Status
+from tests.servers.faults import ErrorStatus, Request, SlowAnswer
 from tests.servers.hub import Hub, hub_server
 from tests.servers.process import uploads
 
@@ -128,10 +128,10 @@ def test_repositories_with_foreign_files_are_refused(hub, published_release, tmp
     assert hub.files(REPO) == {"thesis.txt": b"years"}
 
 
-def test_an_invalid_release_is_not_uploaded(hub, damaged):
-    (damaged / "meta/info.json").unlink()
+def test_an_invalid_release_is_not_uploaded(hub, release_copy):
+    (release_copy / "meta/info.json").unlink()
     with pytest.raises(ReleaseError, match=r"not valid: meta/info\.json: listed in the manifest, but missing"):
-        upload_release(damaged, ADDRESS)
+        upload_release(release_copy, ADDRESS)
     assert not hub.log
 
 
@@ -146,10 +146,10 @@ def test_a_killed_upload_resumes(hub, published_release):
     """Kill an upload and repeat the command: completely uploaded files are not sent again."""
     puts = 0
 
-    def delay_after_three_uploads(request: Request) -> Slow | None:
+    def delay_after_three_uploads(request: Request) -> SlowAnswer | None:
         nonlocal puts
         puts += request.method == "PUT"
-        return Slow(60) if request.method == "PUT" and puts > 3 else None
+        return SlowAnswer(60) if request.method == "PUT" and puts > 3 else None
 
     hub.faults.add(delay_after_three_uploads)
     command = [sys.executable, "-m", "icrl4aht_data", "upload", str(published_release), ADDRESS]
@@ -184,7 +184,7 @@ def test_a_killed_upload_resumes(hub, published_release):
 def test_server_errors_are_reported_and_repeating_the_upload_succeeds(
     hub, published_release, path, method, status, message
 ):
-    hub.faults.next(Status(status), times=9, path=path, method=method)
+    hub.faults.next(ErrorStatus(status), times=9, path=path, method=method)
     with pytest.raises(UploadError, match=rf"^us/histories at http://127\.0\.0\.1:\d+: .*{status}.*; .*{message}"):
         upload_release(published_release, ADDRESS)
     assert not hub.repos or not hub.repo(REPO).tags

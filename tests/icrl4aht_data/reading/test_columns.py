@@ -23,7 +23,7 @@ def expert_labels(greedy: float, sampled: float, view: LabelView = "ego") -> Exp
 
 @pytest.fixture(scope="module")
 def expert_release(tmp_path_factory):
-    """Return a release of four tasks with expert returns 9.5, 0.0 (16.9 sampled), -30.0 and unknown."""
+    """Return a release of four tasks with expert returns 9.5, 0.0, -30.0 and unknown."""
     root = tmp_path_factory.mktemp("measured") / "release"
     experts = [expert_labels(9.5, 10.0), expert_labels(0.0, 16.9), expert_labels(-30.0, 1.0, "state"), None]
     random_release(root, streams=2, experts=experts, sources=["ppo", "ppo", "search", "search"], swap=4)
@@ -51,7 +51,7 @@ def test_unknown_column_raises_error_with_the_nearest_name(lite, name, nearest):
 
 
 @pytest.mark.parametrize("name", [None, 3, ["layout"], np.array(["layout", "split"])])
-def test_column_name_that_is_no_text_raises_package_error(lite, name):
+def test_column_name_that_is_not_a_string_raises_package_error(lite, name):
     with pytest.raises(UnknownNameError, match=r"unknown column .*; valid: history_id, "):
         load_icrl4aht(lite[0]).column(name)
 
@@ -142,7 +142,7 @@ def test_counts_and_describe_summarize_a_selection(two_sources):
 
 
 class TestWeakLabels:
-    """The histories are random play, which earns slightly less than 0 in all tasks."""
+    """Test the warning about labels with low returns; the histories are random play with returns slightly below 0."""
 
     def test_weak_labels_warning_names_tasks_and_returns(self, expert_release):
         dataset = load_icrl4aht(expert_release, layout="demo_wide")
@@ -156,7 +156,7 @@ class TestWeakLabels:
         assert warning.filename == __file__
 
     @pytest.mark.parametrize(("ends", "weak"), [([20.0, 18.2], True), ([20.0, 17.0], False), ([-4.0, -1.0], False)])
-    def test_warning_appears_if_labels_earn_less_than_half_of_the_histories(
+    def test_warning_appears_if_the_expert_has_less_than_half_the_return_of_the_histories(
         self, expert_release, monkeypatch, ends, weak
     ):
         dataset = load_icrl4aht(expert_release).select([0, 1])
@@ -167,5 +167,5 @@ class TestWeakLabels:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             dataset.dpt(batch_size=2, context=5)
-        # the expert labels of both histories earn a return of 9.5
+        # the expert's return is 9.5 for both histories
         assert [one.category for one in caught] == [WeakLabelsWarning] * weak

@@ -11,7 +11,7 @@ import pytest
 from icrl4aht_data import get_layout, load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, OptionError, UnknownNameError
 from icrl4aht_data.overcooked.observe import observe
-from tests.helpers.batches import assert_equal
+from tests.helpers.batches import assert_equal_batches
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_with_options_shares_index_and_shards(lite, converted_release):
     assert states.index is dataset.index
     assert states[0]._shard is dataset[0]._shard
     expected = load_icrl4aht(lite[0], layout="demo_wide", obs="state").ad(batch_size=3, length=9)
-    assert_equal(states.ad(batch_size=3, length=9)[0], expected[0])
+    assert_equal_batches(states.ad(batch_size=3, length=9)[0], expected[0])
     with pytest.raises(UnknownNameError, match="unknown obs 'float16'; valid: float32, uint8, state"):
         dataset.with_options(obs="float16")  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="threads = 0"):

@@ -21,7 +21,7 @@ from icrl4aht_data.writing.published import PUBLISHED_FIELDS, from_published, to
 from icrl4aht_data.writing.release_folder import HISTORIES_INDEX
 from tests.helpers.batches import CACHES
 from tests.helpers.published_files import KEPT, SHARD
-from tests.helpers.random_releases import long_index, make_tasks, one_history_release, random_release
+from tests.helpers.random_releases import make_tasks, one_history_release, random_release, write_long_index
 from tests.helpers.spoiled import change_file, read_lines, spoil
 
 
@@ -63,7 +63,7 @@ class TestConversion:
             from_published(published_folder[0], tmp_path / "out", kind, kept_steps=KEPT)
 
     def test_releases_with_states_can_be_converted_to_observations(self, lite, reconverted_release, tmp_path):
-        """Lite releases and published files with states can be converted without their states."""
+        """Convert a lite release, and published files with states, to releases of observations without states."""
         to_published(load_icrl4aht(lite[0]), tmp_path / "files")
         to_release(load_icrl4aht(lite[0]), tmp_path / "one", "observations")
         assert from_published(tmp_path / "files", tmp_path / "two", "observations", kept_steps=KEPT) == "observations"
@@ -77,24 +77,24 @@ class TestConversion:
             from_published(tmp_path / "files", tmp_path / "out", kept_steps=KEPT)
 
 
-def assign(name: str, where: Any, value: Any):
+def assign_values(name: str, where: Any, value: Any):
     def assign_value(file: Any, index: list[dict]) -> None:
         array = file[name][()].astype("f4")
         array[where] = value
-        rewrite(name, array)(file, index)
+        replace_dataset(name, array)(file, index)
 
     return assign_value
 
 
-def delete(name: str):
+def delete_dataset(name: str):
     return lambda file, index: file.pop(name)
 
 
-def rewrite(name: str, content: Any):
+def replace_dataset(name: str, content: Any):
     return lambda file, index: (file.pop(name), file.create_dataset(name, data=content))
 
 
-def edit_line(number: int, **fields: Any):
+def edit_index_line(number: int, **fields: Any):
     return lambda file, index: index[number].update(fields)
 
 
@@ -103,39 +103,45 @@ class TestFaultyFiles:
         ("spoil", "message"),
         [
             (
-                assign("/1/obs", (7, 1, 2, 3), 0.5),
+                assign_values("/1/obs", (7, 1, 2, 3), 0.5),
                 r"group /1: obs\[7, 1, 2, 3\]: expected an integer 0\.\.255, .* 0\.5",
             ),
-            (assign("/0/obs", (0, 0, 0, 0), 256), r"group /0: obs\[0, 0, 0, 0\]: expected .* found 256"),
-            (assign("/3/obs", (0, 0, 0, 0), np.nan), r"group /3: obs.* found nan"),
-            (assign("/0/actions", 9, 6), r"group /0: actions\[9\]: expected an integer 0\.\.5, found 6"),
-            (assign("/1/expert_actions", 2, 1.5), r"group /1: expert_actions\[2\]"),
-            (assign("/2/rewards", 5, 0.25), r"group /2: rewards\[5\]: expected an integer -128\.\.127, found 0\.25"),
-            (assign("/2/dones", 5, 2), r"group /2: dones\[5\]: expected an integer 0\.\.1, found 2"),
+            (assign_values("/0/obs", (0, 0, 0, 0), 256), r"group /0: obs\[0, 0, 0, 0\]: expected .* found 256"),
+            (assign_values("/3/obs", (0, 0, 0, 0), np.nan), r"group /3: obs.* found nan"),
+            (assign_values("/0/actions", 9, 6), r"group /0: actions\[9\]: expected an integer 0\.\.5, found 6"),
+            (assign_values("/1/expert_actions", 2, 1.5), r"group /1: expert_actions\[2\]"),
             (
-                assign("/2/dones", 5, 1),
+                assign_values("/2/rewards", 5, 0.25),
+                r"group /2: rewards\[5\]: expected an integer -128\.\.127, found 0\.25",
+            ),
+            (assign_values("/2/dones", 5, 2), r"group /2: dones\[5\]: expected an integer 0\.\.1, found 2"),
+            (
+                assign_values("/2/dones", 5, 1),
                 r"group /2: dones: expected an episode end every 20 steps, found 4 .*\[5, 19, 39\].*--kept",
             ),
-            (delete("/1/obs"), r"histories\.h5, group /1: missing obs: complete the file"),
-            (delete("/1/expert_actions"), r"group /1: missing expert_actions: complete the file"),
-            (delete("/3"), r"group /3 is missing, but the index has a line"),
+            (delete_dataset("/1/obs"), r"histories\.h5, group /1: missing obs: complete the file"),
+            (delete_dataset("/1/expert_actions"), r"group /1: missing expert_actions: complete the file"),
+            (delete_dataset("/3"), r"group /3 is missing, but the index has a line"),
             (
-                rewrite("/0/actions", np.zeros(9, "i4")),
+                replace_dataset("/0/actions", np.zeros(9, "i4")),
                 r"group /0: actions: .*expected numbers of shape \(120,\), found int32 of shape \(9,\)",
             ),
             (
-                rewrite("/0/actions", np.array([b"x"] * 120)),
+                replace_dataset("/0/actions", np.array([b"x"] * 120)),
                 r"group /0: actions: .*expected numbers or small arrays of numbers, found \|S1",
             ),
-            # Both layouts have equally many channels, so conversion cannot find this fault.
-            (edit_line(2, layout="demo_simple"), None),
-            (edit_line(2, split="test", layout="demo_wide"), r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)"),
+            # Both layouts have the same number of channels, so conversion cannot find this fault.
+            (edit_index_line(2, layout="demo_simple"), None),
             (
-                edit_line(1, teammate_kind="other"),
+                edit_index_line(2, split="test", layout="demo_wide"),
+                r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)",
+            ),
+            (
+                edit_index_line(1, teammate_kind="other"),
                 r"index\.jsonl: history 1 has .*'other'.*, but its task 'task_a' has",
             ),
-            (edit_line(1, T="many"), r"index\.jsonl, line 2: Expected `int`, got `str` - at `\$\.T`"),
-            (edit_line(3, layout="nowhere"), r"index\.jsonl, line 4: unknown layout"),
+            (edit_index_line(1, T="many"), r"index\.jsonl, line 2: Expected `int`, got `str` - at `\$\.T`"),
+            (edit_index_line(3, layout="nowhere"), r"index\.jsonl, line 4: unknown layout"),
         ],
     )
     def test_faults_of_published_files_are_found(self, published_folder, tmp_path, spoil, message):
@@ -152,7 +158,7 @@ class TestFaultyFiles:
             from_published(files, tmp_path / "out", kept_steps=KEPT)
         assert not (tmp_path / "out").exists()
 
-    def test_files_with_another_episode_length_are_refused(self, published_folder, tmp_path):
+    def test_files_with_an_unexpected_episode_length_are_refused(self, published_folder, tmp_path):
         message = "group /0: dones: expected an episode end every 100 steps, found 6"
         with pytest.raises(PublishedFormatError, match=message):
             from_published(published_folder[0], tmp_path / "out")
@@ -216,8 +222,8 @@ class TestMissingStates:
             mixed = load_icrl4aht(converted_release, layout="demo_wide", cache=cache)
             assert mixed.ad(batch_size=9, length=5)[0].prev_teammate_actions is None
 
-    def test_has_teammate_actions_is_read_from_a_large_index(self, tmp_path):
-        long_index(tmp_path / "r")
+    def test_column_has_teammate_actions_is_read_from_a_large_index(self, tmp_path):
+        write_long_index(tmp_path / "r")
         has = [number % 3 > 0 for number in range(3000)]
         change = {number: {"has_teammate_actions": value} for number, value in enumerate(has)}
         spoil(tmp_path / "r", HISTORIES, lambda lines: [lines[number].update(change[number]) for number in change])
@@ -271,7 +277,7 @@ class TestBatches:
         with pytest.raises(LabelsMissingError, match="labels = expert: 1 of 1 histories have no expert actions"):
             load_icrl4aht(converted_release, task_id="task_b").dpt(batch_size=2, context=5)
 
-    def test_saved_position_of_other_contexts_is_refused(self, lite, reconverted_release):
+    def test_position_saved_with_other_excluded_steps_is_refused(self, lite, reconverted_release):
         roots = lite[0], reconverted_release
         one, two = (load_icrl4aht(root, layout="demo_wide").dpt(batch_size=2, context=5) for root in roots)
         with one.batches() as batches, pytest.raises(OptionError, match="excluded"):

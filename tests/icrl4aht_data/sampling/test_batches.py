@@ -1,4 +1,4 @@
-"""Test prefetched batches: order, buffers, devices, errors and resume."""
+"""Test prefetched batches: order, buffers, devices, errors and resuming."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from tests.helpers.batches import CACHES, assert_equal
+from tests.helpers.batches import CACHES, assert_equal_batches
 from tests.helpers.random_releases import SHARD
 
 
@@ -31,7 +31,7 @@ def test_prefetched_batches_keep_their_order(sampler, prefetch, reuse):
     numbers, buffers = iter(range(4, 24)), set()
     with sampler.batches(4, 24, prefetch=prefetch, reuse=reuse) as batches:
         for batch in batches:
-            assert_equal(batch, sampler[next(numbers)])
+            assert_equal_batches(batch, sampler[next(numbers)])
             buffers.add(batch.obs.ctypes.data)
     assert not reuse or len(buffers) <= prefetch + 1
     assert (batches.served, batches.next) == (20, 24)
@@ -54,7 +54,7 @@ def test_second_loop_over_batches_continues_after_the_first(sampler, prefetch):
     finished.load_state_dict({"next": 4, **sampler.options()})
     assert list(finished) == []
     again = sampler.batches(stop=2)
-    assert_equal([*again, *again][3], sampler[3])
+    assert_equal_batches([*again, *again][3], sampler[3])
 
 
 def _aligned_empty(array):
@@ -74,7 +74,7 @@ def test_batches_on_a_device_equal_the_batches_of_the_sampler(sampler, monkeypat
         assert isinstance(batch.obs, jax.Array)
         assert batch.prev_teammate_actions is None
         in_32_bits = jax.tree.map(lambda array: np.asarray(jax.numpy.asarray(array)), sampler[i])
-        assert_equal(jax.tree.map(np.asarray, batch), in_32_bits)
+        assert_equal_batches(jax.tree.map(np.asarray, batch), in_32_bits)
 
 
 def test_prefetching_stops_after_the_given_number_of_batches(sampler, monkeypatch):
@@ -87,9 +87,9 @@ def test_prefetching_stops_after_the_given_number_of_batches(sampler, monkeypatc
 
 
 @pytest.mark.parametrize("prefetch", [0, 2])
-def test_exception_while_prefetching_is_raised_to_the_consumer(damaged, prefetch):
-    (damaged / SHARD).write_bytes((damaged / SHARD).read_bytes()[:3000])
-    batches = load_icrl4aht(damaged, layout="coord_simple").ad(batch_size=8, length=9).batches(prefetch=prefetch)
+def test_exception_while_prefetching_is_raised_in_the_consumer(release_copy, prefetch):
+    (release_copy / SHARD).write_bytes((release_copy / SHARD).read_bytes()[:3000])
+    batches = load_icrl4aht(release_copy, layout="coord_simple").ad(batch_size=8, length=9).batches(prefetch=prefetch)
     with pytest.raises(Exception, match="truncated"):
         next(batches)
     assert next(batches, None) is None
@@ -122,7 +122,7 @@ def test_resumed_batches_continue_after_the_last_consumed_batch(sampler):
     with sampler.batches() as resumed:
         next(resumed)
         resumed.load_state_dict(state)
-        assert_equal(next(resumed), sampler[4])
+        assert_equal_batches(next(resumed), sampler[4])
 
 
 SIZES: dict[str, Any] = {"batch_size": 3, "length": 9}
@@ -137,23 +137,25 @@ OTHER_BATCHES = {
 
 
 @pytest.mark.parametrize("message", OTHER_BATCHES)
-def test_saved_position_of_other_batches_is_refused(two_sources, message):
+def test_position_saved_by_a_different_sampler_is_refused(two_sources, message):
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
     state = dataset.ad(**SIZES).batches(prefetch=0).state_dict()
     with pytest.raises(OptionError, match=message):
         OTHER_BATCHES[message](dataset).batches(prefetch=0).load_state_dict(state)
 
 
-def test_position_saved_before_an_option_existed_is_resumed(two_sources):
+def test_position_saved_before_an_option_existed_can_be_resumed(two_sources):
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
     for sampler in (dataset.ad(**SIZES), dataset.dpt(batch_size=3, context=9)):
         batches = sampler.batches(prefetch=0)
         state = {name: value for name, value in batches.state_dict().items() if name not in ("channels", "labels")}
         batches.load_state_dict(state | {"next": 7})
-        assert_equal(next(batches), sampler[7])
+        assert_equal_batches(next(batches), sampler[7])
 
 
-@pytest.mark.parametrize("cache", CACHES)
+@pytest.mark.parametrize(
+    "cache", [pytest.param(cache, marks=[pytest.mark.slow] * (cache != "stream")) for cache in CACHES]
+)
 def test_memory_use_stays_constant_over_many_batches(lite, cache):
     def resident_bytes() -> int:
         gc.collect()

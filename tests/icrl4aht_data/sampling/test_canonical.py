@@ -14,7 +14,7 @@ from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, channel_names
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import record_size
-from tests.helpers.batches import CACHES, assert_equal
+from tests.helpers.batches import CACHES, assert_equal_batches
 
 LAYOUTS = ["coord_simple", "demo_wide"]
 """The layouts of `lite`, `full` and `reconverted_release`: 40 and 45 channels."""
@@ -23,7 +23,7 @@ RELEASES = ["lite", "full", "reconverted_release"]
 
 @pytest.fixture(params=RELEASES)
 def root(request):
-    """Return a release of the same histories with states, with states and observations, or with observations."""
+    """Return a release with state records, with state records and observations, or with observations only."""
     made = request.getfixturevalue(request.param)
     return made if request.param == "reconverted_release" else made[0]
 
@@ -60,7 +60,7 @@ def ad_and_dpt_samplers(dataset):
 
 
 def render_canonical(records, layouts):
-    """Return canonical observations of records, uint8 (B, ..., S), on layouts numbered by int (B,)."""
+    """Return canonical observations of state records uint8 (B, ..., S); `layouts` are indices into `LAYOUTS`, (B,)."""
     views = []
     for row, number in zip(records, layouts, strict=True):
         layout = get_layout(LAYOUTS[number])
@@ -89,7 +89,7 @@ def test_batches_equal_rendered_state_records(lite, cache):
                 if name == "obs":
                     expected[~stored.attention_mask] = 0
                 np.testing.assert_array_equal(shown, expected)
-            assert_equal(
+            assert_equal_batches(
                 batch._replace(layouts=stored.layouts, **{n: None for n in batch._fields if n.endswith("obs")}),
                 stored._replace(**{n: None for n in batch._fields if n.endswith("obs")}),
             )
@@ -103,7 +103,7 @@ def test_stored_observations_are_mapped_to_canonical_channels(lite, reconverted_
     assert not stored.has_states
     for length in (1, 40, 130):
         options = {"batch_size": 8, "length": length, "seed": 5}
-        assert_equal(original.ad(**options)[3], stored.ad(**options)[3])
+        assert_equal_batches(original.ad(**options)[3], stored.ad(**options)[3])
     one = stored.filter(layout="demo_wide")
     own = one.with_options(channels="own")
     for order in ("contiguous", "random"):

@@ -59,14 +59,14 @@ def test_windows_contain_only_every_nth_episode(two_sources, cache, every):
 
 
 def test_all_starts_of_windows_are_drawn(two_sources):
-    """Every second of six episodes gives two sequences of three episodes, with 14 starts each."""
+    """With `every` = 2, six episodes form two sequences of three episodes; windows can start at 14 steps of each."""
     sampler = load_icrl4aht(two_sources[0], layout="demo_wide", split="train").ad(every=2, **OPTIONS)
     starts = np.concatenate([sampler.windows(i)[1] for i in range(40)])
     assert set(starts.tolist()) == {*range(14), *range(LENGTH, LENGTH + 14)}
 
 
 def test_every_option_respects_episode_range_and_curriculum(two_sources):
-    """The episode range is the last four of six episodes; batch 0 uses its first half, episodes 2 and 3."""
+    """The episode range is the last four of six episodes; batch 0 starts in its first half, episodes 2 and 3."""
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
     parts = dataset.ad(every=2, episodes=(-4, None), curriculum=Curriculum(9, (0, 0.5), (0.5, 1)), **OPTIONS)
     for i, first in ((0, 2), (9, 4), (50, 4)):

@@ -13,7 +13,7 @@ from icrl4aht_data.format.schema import HISTORIES, PROVENANCE
 from icrl4aht_data.interop import hf_episodes
 from icrl4aht_data.reading.history import LABELS
 from icrl4aht_data.writing.convert import to_release
-from tests.helpers.batches import CACHES, assert_equal
+from tests.helpers.batches import CACHES, assert_equal_batches
 from tests.helpers.two_sources import two_source_release
 
 OPTIONS: dict[str, Any] = {"batch_size": 16, "context": 9, "seed": 4}
@@ -46,7 +46,7 @@ def test_labels_option_changes_only_the_targets(two_sources, cache, labels):
     options: dict[str, Any] = {"batch_size": 16, "length": 50, "seed": 4, "episodes": (-2, None)}
     plain, labelled = dataset.ad(**options), dataset.ad(labels=labels, **options)
     taken, batch = plain[1], labelled[1]
-    assert_equal(taken, batch._replace(target_actions=taken.target_actions))
+    assert_equal_batches(taken, batch._replace(target_actions=taken.target_actions))
     ids, starts = labelled.windows(1)
     assert not batch.attention_mask.all()
     for row, (history, start) in enumerate(zip(ids.tolist(), starts.tolist(), strict=True)):
@@ -75,7 +75,7 @@ class TestNoiseWithoutOracleActions:
     ):
         options: dict[str, Any] = {"layout": "demo_wide", "cache": cache} | filters
         one, other = (load_icrl4aht(root, **options) for root in (two_sources[0], release_without_noise_oracle))
-        assert_equal(one.dpt(labels="oracle", **OPTIONS)[0], other.dpt(labels="oracle", **OPTIONS)[0])
+        assert_equal_batches(one.dpt(labels="oracle", **OPTIONS)[0], other.dpt(labels="oracle", **OPTIONS)[0])
 
     def test_oracle_labels_are_counted_and_read_from_expert_actions(self, two_sources, release_without_noise_oracle):
         dataset = load_icrl4aht(release_without_noise_oracle, source="noise")

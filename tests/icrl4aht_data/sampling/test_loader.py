@@ -13,7 +13,7 @@ from icrl4aht_data.errors import UnknownNameError
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.sources import choose_cache
 from icrl4aht_data.writing.convert import to_release
-from tests.helpers.batches import CACHES, assert_equal, samplers
+from tests.helpers.batches import CACHES, assert_equal_batches, example_samplers
 from tests.helpers.random_releases import random_release
 
 LAYOUTS = ("coord_simple", "demo_simple", "coord_ring")
@@ -34,7 +34,7 @@ class TestCaches:
     def test_all_caches_give_equal_batches(self, lite, full, reconverted_release, obs):
         for kinds in ((lite[0], full[0]), (reconverted_release,)[obs == "state" :]):
             all_samplers = (
-                samplers(load_icrl4aht(root, layout="demo_wide", obs=obs, cache=cache, threads=threads), seed=4)
+                example_samplers(load_icrl4aht(root, layout="demo_wide", obs=obs, cache=cache, threads=threads), seed=4)
                 for cache in CACHES
                 for root in kinds
                 for threads in (1, 3)
@@ -42,14 +42,14 @@ class TestCaches:
             for sampler, *others in zip(*all_samplers, strict=True):
                 for i in (0, 77):
                     for other in others:
-                        assert_equal(sampler[i], other[i])
-                assert_equal(pickle.loads(pickle.dumps(others[-1]))[5], sampler[5])
+                        assert_equal_batches(sampler[i], other[i])
+                assert_equal_batches(pickle.loads(pickle.dumps(others[-1]))[5], sampler[5])
 
     def test_histories_may_be_reordered_and_repeated(self, lite):
         mixed = load_icrl4aht(lite[0], layout="demo_wide", obs="state").select([9, 6, 9, 11])
         sampler = mixed.ad(batch_size=9, length=20)
         for cache in CACHES:
-            assert_equal(mixed.with_options(cache=cache).ad(batch_size=9, length=20)[0], sampler[0])
+            assert_equal_batches(mixed.with_options(cache=cache).ad(batch_size=9, length=20)[0], sampler[0])
         batch, (ids, starts) = sampler[0], sampler.windows(0)
         for row, (history_id, start) in enumerate(zip(ids, starts, strict=True)):
             np.testing.assert_array_equal(batch.obs[row], lite[1][history_id]["state"][start : start + 20])
@@ -69,7 +69,7 @@ class TestCaches:
         sampler = load_icrl4aht(lite[0], layout="demo_wide", cache="stream", threads=2).ad(batch_size=9, length=30)
         with ThreadPoolExecutor(12) as pool:
             for k, batch in enumerate(pool.map(lambda k: sampler[k % 4], range(12))):
-                assert_equal(batch, sampler[k % 4])
+                assert_equal_batches(batch, sampler[k % 4])
 
 
 @pytest.mark.parametrize("cache", CACHES)
@@ -97,7 +97,7 @@ class TestSeveralLayouts:
     @pytest.mark.parametrize("obs", ["float32", "uint8"])
     def test_releases_with_and_without_states_give_equal_batches(self, three_layouts, cache, obs):
         one, two = (load_icrl4aht(three_layouts[0] / name, obs=obs, cache=cache) for name in ("states", "observations"))
-        assert_equal(one.ad(batch_size=16, length=130)[0], two.ad(batch_size=16, length=130)[0])
+        assert_equal_batches(one.ad(batch_size=16, length=130)[0], two.ad(batch_size=16, length=130)[0])
         batch = two.dpt(batch_size=16, context=30)[0]
         assert batch.layouts is None
         assert batch.query_obs.any(axis=(1, 2, 3)).all()
@@ -162,10 +162,10 @@ class TestOptions:
         query, _, context, _ = dataset.dpt(batch_size=100, context=9, weights=[1e308] * 6)._draw(0)
         assert len(set(query.tolist())) == len(set(context.tolist())) == 6
 
-    def test_shares_of_processes_concatenate_to_the_full_batch(self, lite):
+    def test_batch_shares_of_all_processes_concatenate_to_the_full_batch(self, lite):
         dataset = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8")
-        shares = (samplers(dataset, process_index=k, process_count=3) for k in range(3))
-        for undivided, *parts in zip(samplers(dataset), *shares, strict=True):
+        shares = (example_samplers(dataset, process_index=k, process_count=3) for k in range(3))
+        for undivided, *parts in zip(example_samplers(dataset), *shares, strict=True):
             batches = [part[5] for part in parts]
             for name, array in undivided[5]._asdict().items():
                 if array is not None:
@@ -186,10 +186,10 @@ class TestOptions:
 
 def test_batch_is_written_into_the_given_buffers(lite, reconverted_release):
     for root in (lite[0], reconverted_release):
-        for sampler in samplers(load_icrl4aht(root, layout="demo_wide", obs="uint8")):
+        for sampler in example_samplers(load_icrl4aht(root, layout="demo_wide", obs="uint8")):
             out = sampler.empty()
             for array in out:
                 if array is not None:
                     array.fill(1)
             assert sampler.batch(3, out) is out
-            assert_equal(out, sampler[3])
+            assert_equal_batches(out, sampler[3])

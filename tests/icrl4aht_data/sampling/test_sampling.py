@@ -122,13 +122,13 @@ def test_several_queries_of_a_context_are_steps_of_one_history(lite_or_full, ord
 
 
 def _rows(arrays, *names):
-    """Return each step's values as a hashable tuple."""
+    """Return a list of hashable tuples, each with the values of one step."""
     columns = [np.asarray(arrays[name]) for name in names or arrays]
     return [tuple(x.tobytes() if x.ndim else float(x) for x in row) for row in zip(*columns, strict=True)]
 
 
 def _transitions(arrays):
-    """Return each step's values, with the state after the step in its episode, as a hashable tuple."""
+    """Return a list of hashable tuples, each with the values of one step and the state after the step."""
     following = np.roll(arrays["state"], -1, axis=0)
     following[arrays["dones"]] = arrays["episode_end_state"]
     return _rows(arrays | {"following": following}, "state", "following", "actions", "teammate_actions", "rewards")

@@ -1,4 +1,4 @@
-"""Test that plugins of entry points are found by name, imported on demand, and raise clear errors if broken."""
+"""Test plugins registered by entry points: lookup by name, import on demand, and errors of broken plugins."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from icrl4aht_data.commands import doctor
 from icrl4aht_data.errors import OptionError, PluginError, UnknownNameError
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_positions
 from icrl4aht_data.overcooked.layouts import LAYOUTS
-from tests.helpers.plugins import installed, write_package
+from tests.helpers.plugins import installed_plugins, write_package
 from tests.helpers.random_releases import random_release
 
 MAPS = """
@@ -70,7 +70,7 @@ def plugin_folder(tmp_path_factory) -> Path:
 
 
 def test_registered_layout_can_be_used_by_name(plugin_folder, tmp_path):
-    with installed(plugin_folder):
+    with installed_plugins(plugin_folder):
         layout = get_layout("plain_room")
         assert layout is get_layout("plain_room")
         task = make_task("layout", "test", "plain_room", heuristic_teammate("utility_greedy", "default", 0), 0)
@@ -84,14 +84,17 @@ def test_registered_layout_can_be_used_by_name(plugin_folder, tmp_path):
 
 def test_plugins_do_not_change_the_benchmark(plugin_folder):
     before = CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES]
-    with installed(plugin_folder):
+    with installed_plugins(plugin_folder):
         assert before == (CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES])
         assert [layout_number(name) for name in LAYOUT_NAMES] == list(range(10))
         assert 10 <= layout_number("plain_room") == layout_number("plain_room") < 20_000
 
 
 def test_layout_with_unknown_ingredients_has_no_canonical_channels(plugin_folder):
-    with installed(plugin_folder), pytest.raises(OptionError, match=r"layout spicy_room: channels .*ingredient_7"):
+    with (
+        installed_plugins(plugin_folder),
+        pytest.raises(OptionError, match=r"layout spicy_room: channels .*ingredient_7"),
+    ):
         canonical_positions(get_layout("spicy_room"))
 
 
@@ -104,7 +107,7 @@ def test_layout_with_unknown_ingredients_has_no_canonical_channels(plugin_folder
     ],
 )
 def test_broken_layout_plugin_raises_error_when_used(plugin_folder, name, problem):
-    with installed(plugin_folder):
+    with installed_plugins(plugin_folder):
         with pytest.raises(UnknownNameError, match=name):
             get_layout("missing")
         with pytest.raises(PluginError, match=f"^package rooms 0.1, entry point icrl4aht.layouts: {name} .*{problem}"):
@@ -113,7 +116,7 @@ def test_broken_layout_plugin_raises_error_when_used(plugin_folder, name, proble
 
 def test_broken_teammate_and_method_plugins_raise_errors(plugin_folder):
     world = overcooked_world([LAYOUTS["demo_wide"]])
-    with installed(plugin_folder):
+    with installed_plugins(plugin_folder):
         with pytest.raises(PluginError, match=r"rooms 0.1.*expected kind 'greedy_too', found 'utility_greedy'"):
             heuristic_teammate("greedy_too", "default", 0)
         assert get_method("my_ad")(ModelOptions(), world).label == get_method("ad")(ModelOptions(), world).label
@@ -141,7 +144,7 @@ def test_broken_teammate_and_method_plugins_raise_errors(plugin_folder):
 def test_plugins_with_clashing_or_invalid_names_raise_errors(registered, message, tmp_path):
     for name, layout in registered.items():
         write_package(tmp_path, name, {}, {"icrl4aht.layouts": {layout: "json:loads"}})
-    with installed(tmp_path):
+    with installed_plugins(tmp_path):
         with pytest.raises(PluginError, match=message):
             get_layout("elsewhere")
         assert get_layout("demo_wide") is LAYOUTS["demo_wide"]

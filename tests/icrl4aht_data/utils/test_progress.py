@@ -1,4 +1,4 @@
-"""Test progress output: bars on terminals, and otherwise lines, which a fake clock times."""
+"""Test progress output with a fake clock: bars on terminals, lines elsewhere."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def four_tasks() -> Tasks:
 
 @pytest.fixture
 def write_meta(lite, tmp_path) -> Callable[..., dict[str, Any]]:
-    """Return a function that writes meta/ and returns the values for the card; `change` edits each provenance."""
+    """Return a function that writes meta/ of a release and returns the card's values; `change` edits provenances."""
     like = read_index(lite[0]).entries[0]
 
     def write_meta(tasks: Tasks | None = None, change: Change = lambda of: of, **fields: Any) -> dict[str, Any]:
@@ -83,7 +83,7 @@ def write_meta(lite, tmp_path) -> Callable[..., dict[str, Any]]:
     return write_meta
 
 
-def test_card_lists_learning_by_layout_source_and_split(write_meta):
+def test_card_lists_returns_by_layout_source_and_split(write_meta):
     content = write_meta()
     rows = [tuple(row.values()) for row in content["learning"]]
     assert rows == [
@@ -132,7 +132,7 @@ def test_bundled_card_is_short_and_up_to_date():
     assert len(words) <= 2500
 
 
-def test_card_of_human_histories_states_personal_data():
+def test_card_of_human_histories_describes_personal_data():
     assert rai_texts({"noise"})["personal_sensitive_information"] == "None."
     rai = rai_texts({"noise", "human"})
     assert "Pseudonyms" in rai["personal_sensitive_information"] and rai.keys() == rai_texts({"noise"}).keys()

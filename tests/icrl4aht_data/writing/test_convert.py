@@ -20,7 +20,7 @@ from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.minari import to_minari
 from icrl4aht_data.writing.parquet import to_parquet
 from icrl4aht_data.writing.published import PUBLISHED_FIELDS, from_published, to_published
-from tests.helpers.batches import digest
+from tests.helpers.batches import batches_digest
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def test_full_and_lite_releases_convert_into_each_other(request, tmp_path, start
     to_release(load_icrl4aht(root), tmp_path / "out", kind)
     assert verify_release(tmp_path / "out", level="deep").ok
     assert load_icrl4aht(tmp_path / "out").info.kind == kind
-    assert digest(tmp_path / "out") == digest(root)
+    assert batches_digest(tmp_path / "out") == batches_digest(root)
     assert (tmp_path / "out" / "meta" / "tasks.jsonl").read_text() == (root / "meta" / "tasks.jsonl").read_text()
 
 
@@ -69,7 +69,7 @@ def test_published_files_have_the_format_of_the_paper(lite, published_files):
 def test_published_files_convert_back_to_the_same_release(lite, published_files, tmp_path):
     from_published(published_files, tmp_path / "back", "lite", data_version="0.0.1", kept_steps=20)
     assert verify_release(tmp_path / "back", level="deep").ok
-    assert digest(tmp_path / "back") == digest(lite[0])
+    assert batches_digest(tmp_path / "back") == batches_digest(lite[0])
     for name in ("meta/histories.jsonl", "meta/tasks.jsonl", "meta/provenance.json", "meta/info.json"):
         assert (tmp_path / "back" / name).read_text() == (lite[0] / name).read_text()
 

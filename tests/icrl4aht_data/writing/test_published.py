@@ -18,7 +18,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import fixed_channels
 from icrl4aht_data.writing.published import from_published, to_published
 from icrl4aht_data.writing.release_folder import HISTORIES_INDEX
-from tests.helpers.damages import contents
+from tests.helpers.damages import file_contents
 from tests.helpers.published_files import KEPT
 from tests.helpers.random_releases import random_release
 from tests.helpers.spoiled import change_file
@@ -157,12 +157,12 @@ def test_verification_finds_a_history_stored_twice(lite, tmp_path, link):
 def test_conversion_overwrites_its_own_files_but_no_other_folders(lite, tmp_path):
     dataset, out = load_icrl4aht(lite[0]), tmp_path / "out"
     to_published(dataset, out)
-    before = contents(out)
+    before = file_contents(out)
     assert before.keys() == {"histories.h5", "histories_index.jsonl", "tasks.jsonl", "provenance.json"}
-    (tmp_path / ".out.partial").mkdir()  # left by an interrupted conversion
+    (tmp_path / ".out.partial").mkdir()  # an interrupted conversion leaves such a folder
     (tmp_path / ".out.partial" / "histories.h5").write_bytes(before["histories.h5"][:1000])
     to_published(dataset.filter(layout="demo_wide"), out, overwrite=True)
-    assert contents(out)["histories_index.jsonl"] != before["histories_index.jsonl"]
+    assert file_contents(out)["histories_index.jsonl"] != before["histories_index.jsonl"]
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     (out / "notes.txt").write_text("mine")
     with pytest.raises(OptionError, match=r"is not a release: it has no MANIFEST\.sha256"):

@@ -23,7 +23,7 @@ from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.utils.files import file_hash
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from tests.helpers.damages import contents
+from tests.helpers.damages import file_contents
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import make_tasks, random_history, random_release
 
@@ -55,8 +55,8 @@ def test_any_release_round_trips_and_verifies(tmp_path, episodes, length, shard_
 def test_writing_a_release_twice_gives_equal_bytes(tmp_path):
     for name in ("a", "b"):
         random_release(tmp_path / name)
-    assert contents(tmp_path / "a") == contents(tmp_path / "b")
-    assert len(contents(tmp_path / "a")) >= 9
+    assert file_contents(tmp_path / "a") == file_contents(tmp_path / "b")
+    assert len(file_contents(tmp_path / "a")) >= 9
 
 
 def sorted_names(folder):
@@ -138,7 +138,7 @@ def test_second_writer_of_a_release_is_refused(tmp_path):
     assert verify_release(tmp_path / "release").histories == 1
 
 
-def test_release_is_restored_after_a_kill_between_the_two_renames(tmp_path):
+def test_old_release_is_restored_if_a_writer_was_killed_between_two_renames(tmp_path):
     random_release(tmp_path / "release", seed=1)
     before = (tmp_path / "release" / "MANIFEST.sha256").read_bytes()
     (tmp_path / "release").rename(tmp_path / ".release.old")
@@ -178,12 +178,12 @@ def add_listed_note(root: Path) -> None:
 def test_overwrite_refuses_folders_with_other_files(tmp_path, make, message):
     root = tmp_path / "release"
     make(root)
-    before = contents(tmp_path)
+    before = file_contents(tmp_path)
     with pytest.raises(OptionError, match="exists; give another folder, or use --overwrite to replace it"):
         write_cramped_up_release(root, raise_error)
     with pytest.raises(OptionError, match=message):
         write_cramped_up_release(root, raise_error, overwrite=True)
-    assert contents(tmp_path) == before
+    assert file_contents(tmp_path) == before
 
 
 def test_folders_created_during_writing_are_not_replaced(tmp_path):
@@ -205,7 +205,7 @@ def test_folders_created_during_writing_are_not_replaced(tmp_path):
     ("pause", "delay", "streams"),
     [
         (60, 0.0, 2),  # the writer is killed after the first shard
-        pytest.param(0, 0.05, 8, marks=pytest.mark.slow),  # the writer is killed later
+        pytest.param(0, 0.05, 8, marks=pytest.mark.slow),  # the writer is killed after more shards
         pytest.param(0, 0.2, 8, marks=pytest.mark.slow),
     ],
 )

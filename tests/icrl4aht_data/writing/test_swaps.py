@@ -29,7 +29,7 @@ def swap_release(tmp_path_factory) -> Path:
     return root
 
 
-def test_card_states_changes_of_teammates(swap_release):
+def test_card_describes_changes_of_teammates(swap_release):
     content = card_facts(swap_release)
     assert (content["views"], content["swapped"]) == ({"ego": {"ppo": 4}}, 4)
     card = render_card(content)
@@ -57,7 +57,7 @@ def test_teammates_that_share_a_history_are_held_out_together(swap_release, lite
 
 @pytest.mark.parametrize("kind", ["lite", "full", "published"])
 def test_conversions_keep_changes_of_teammates(swap_release, tmp_path, kind):
-    """Copy one of two tasks, so only the provenance contains the teammate of the other task."""
+    """Copy one of two tasks; the teammate of the other task is then stored only in the provenance."""
     part, copy = load_icrl4aht(swap_release).select([1]), tmp_path / "copy"
     if kind == "published":
         to_published(part, tmp_path / "published")

@@ -23,7 +23,7 @@ from icrl4aht_data.format.chunks import chunk_hash
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import CHUNK_DTYPE, HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from tests.helpers.random_releases import SHARD
-from tests.servers.faults import Fault, Long, Redirect
+from tests.servers.faults import Fault, LongBody, Redirect
 
 TABLE = "meta/chunks/teammate/coord_simple/train-00000-of-00001.npy"
 TERABYTE = 2**40
@@ -37,7 +37,7 @@ ChangeFile = Callable[[Any, Path], object]
 
 
 def outside_folder(root: Path) -> Path:
-    """Return the folder that no release may touch."""
+    """Return the folder outside the release, which readers of the release must not touch."""
     return root.parent / "outside"
 
 
@@ -47,7 +47,7 @@ def policy_path(root: Path) -> str:
 
 
 def add_line(name: str) -> Spoil:
-    """Add a line to the manifest."""
+    """Return a function that adds a line to the manifest."""
 
     def append_line(root: Path) -> None:
         with (root / MANIFEST).open("a", encoding="utf-8") as stream:
@@ -56,8 +56,8 @@ def add_line(name: str) -> Spoil:
     return append_line
 
 
-def replaced(name: str | Callable[[Path], str], make: Make) -> Spoil:
-    """Replace a file or folder by what `make` creates."""
+def replace_file(name: str | Callable[[Path], str], make: Make) -> Spoil:
+    """Return a function that replaces a file or folder by the one that `make` creates."""
 
     def replace_path(root: Path) -> None:
         path = root / (name if isinstance(name, str) else name(root))
@@ -82,24 +82,24 @@ def named_pipe(path: Path, root: Path) -> None:
     os.mkfifo(path)
 
 
-def terabyte(path: Path, root: Path) -> None:
+def terabyte_file(path: Path, root: Path) -> None:
     """Create a sparse file of one terabyte, which takes no disk space."""
     with path.open("wb") as stream:
         stream.truncate(TERABYTE)
 
 
-def file_with(text: str | bytes) -> Make:
+def file_of(text: str | bytes) -> Make:
     """Return a function that creates a file with the given content."""
     return lambda path, root: path.write_bytes(text if isinstance(text, bytes) else text.encode())
 
 
 def deep_json(levels: int) -> Make:
     """Return a function that creates a file of nested JSON objects."""
-    return file_with('{"a":' * levels + "1" + "}" * levels)
+    return file_of('{"a":' * levels + "1" + "}" * levels)
 
 
 def change_json(name: str, change: Callable[[Any], Any]) -> Spoil:
-    """Change the parsed content of a JSON file in place, or replace it by the result of `change`."""
+    """Return a function that applies `change` to the content of a JSON file, in place or with a new value as result."""
 
     def rewrite_json(root: Path) -> None:
         value = json.loads((root / name).read_text())
@@ -110,7 +110,7 @@ def change_json(name: str, change: Callable[[Any], Any]) -> Spoil:
 
 
 def change_lines(change: Callable[[list[dict[str, Any]]], list | None], name: str = HISTORIES) -> Spoil:
-    """Change the parsed lines of a file of JSON lines in place, or replace them by the result of `change`."""
+    """Return a function that applies `change` to the lines of a JSONL file, in place or with new lines as result."""
 
     def rewrite_lines(root: Path) -> None:
         values = [json.loads(line) for line in (root / name).read_text().splitlines()]
@@ -122,17 +122,17 @@ def change_lines(change: Callable[[list[dict[str, Any]]], list | None], name: st
 
 
 def set_entry(name: str = HISTORIES, /, **changes: Any) -> Spoil:
-    """Change fields of the first line of the index."""
+    """Return a function that changes fields of the first line of the index."""
     return change_lines(lambda values: values[0].update(changes), name)
 
 
 def change_info(**changes: Any) -> Spoil:
-    """Change fields of info.json."""
+    """Return a function that changes fields of info.json."""
     return change_json(INFO, lambda value: value.update(changes))
 
 
 def set_theta(**changes: Any) -> Spoil:
-    """Change theta of the learned teammate, and update the id of the teammate's task."""
+    """Return a function that changes parameters of the learned teammate and updates the id of its task."""
 
     def rewrite_task(root: Path) -> None:
         tasks = [Task(**json.loads(line)) for line in (root / TASKS).read_text().splitlines()]
@@ -148,8 +148,8 @@ def set_theta(**changes: Any) -> Spoil:
     return rewrite_task
 
 
-def table(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
-    """Change the chunk table of the shard in place, or replace it by the result of `change`."""
+def change_table(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
+    """Return a function that applies `change` to the shard's chunk table, in place or with a new table as result."""
 
     def rewrite_table(root: Path) -> None:
         rows = np.load(root / TABLE)
@@ -159,14 +159,14 @@ def table(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
     return rewrite_table
 
 
-def npy_header(header: str, version: bytes = b"\x01\x00", length: int | None = None) -> Make:
-    """Create a .npy file that ends after its header."""
+def npy_header_only(header: str, version: bytes = b"\x01\x00", length: int | None = None) -> Make:
+    """Return a function that creates a .npy file that ends after the header."""
     size = len(header) if length is None else length
-    return file_with(b"\x93NUMPY" + version + size.to_bytes(2 if version[0] == 1 else 4, "little") + header.encode())
+    return file_of(b"\x93NUMPY" + version + size.to_bytes(2 if version[0] == 1 else 4, "little") + header.encode())
 
 
-def hdf5(change: ChangeFile, name: str = SHARD) -> Spoil:
-    """Change an HDF5 file, but not its chunk table."""
+def change_hdf5(change: ChangeFile, name: str = SHARD) -> Spoil:
+    """Return a function that changes an HDF5 file without updating the chunk table."""
 
     def rewrite_hdf5(root: Path) -> None:
         with h5py.File(root / name, "r+") as file:
@@ -176,27 +176,27 @@ def hdf5(change: ChangeFile, name: str = SHARD) -> Spoil:
 
 
 def set_actions(make: ChangeFile) -> ChangeFile:
-    """Replace the actions of the first group by what `make` creates in the group."""
+    """Return a function that replaces the actions of the first group by the object that `make` creates."""
 
-    def change(file: Any, out: Path) -> None:
+    def replace_actions(file: Any, out: Path) -> None:
         del file["0/actions"]
         make(file["0"], out)
 
-    return change
+    return replace_actions
 
 
-def new_dataset(shape: tuple[int, ...] = (4, 120), dtype: Any = "i1", **options: Any) -> ChangeFile:
-    """Replace the actions by a dataset with these properties."""
+def actions_dataset(shape: tuple[int, ...] = (4, 120), dtype: Any = "i1", **options: Any) -> ChangeFile:
+    """Return a function that replaces the actions by a dataset of a given shape, dtype and storage."""
     return set_actions(lambda group, out: group.create_dataset("actions", shape, dtype, **options))
 
 
-def typed_actions(dtype: Any) -> ChangeFile:
-    """Replace the actions by values of another type."""
-    return new_dataset(dtype=dtype, chunks=(1, 120), compression="gzip")
+def actions_of_type(dtype: Any) -> ChangeFile:
+    """Return a function that replaces the actions by values of another type."""
+    return actions_dataset(dtype=dtype, chunks=(1, 120), compression="gzip")
 
 
-def link(target: Callable[[Path], Any]) -> ChangeFile:
-    """Replace the actions by a link."""
+def link_actions(target: Callable[[Path], Any]) -> ChangeFile:
+    """Return a function that replaces the actions by a link."""
     return set_actions(lambda group, out: group.__setitem__("actions", target(out)))
 
 
@@ -219,19 +219,19 @@ class Case(NamedTuple):
 CASES: dict[str, Case] = {}
 
 
-def add(kind: str, message: str, spoils: Mapping[str, Spoil]) -> None:
-    """Add cases of one kind with the same message."""
+def add_cases(kind: str, message: str, spoils: Mapping[str, Spoil]) -> None:
+    """Add test cases of one kind that must report the same message."""
     for name, spoil in spoils.items():
         add_case(f"{kind}: {name}", Case(kind, message, spoil))
 
 
-def add_hashed(message: str, spoils: Mapping[str, Spoil]) -> None:
-    """Add releases with matching manifests, because an attacker can also write the manifest."""
+def add_hashed_cases(message: str, spoils: Mapping[str, Spoil]) -> None:
+    """Add hostile releases with a matching manifest, because an attacker can also write the manifest."""
 
     def with_manifest(spoil: Spoil) -> Spoil:
         return lambda root: (spoil(root), write_manifest(root))
 
-    add("release", message, {name: with_manifest(spoil) for name, spoil in spoils.items()})
+    add_cases("release", message, {name: with_manifest(spoil) for name, spoil in spoils.items()})
 
 
 def add_case(name: str, case: Case) -> None:
@@ -249,18 +249,22 @@ _NAMES = {
     "control": "meta/\x1b[2J",
     "long": "x" * 300,
 }
-add("release", "points outside the release", {f"manifest: {name}": add_line(path) for name, path in _NAMES.items()})
-add("release", "are the same file on some systems", {"manifest: case": add_line(SHARD.replace("teammate", "TEAMMATE"))})
-add("release", "not a file that a release may contain", {"manifest: code": add_line("sitecustomize.py")})
+add_cases(
+    "release", "points outside the release", {f"manifest: {name}": add_line(path) for name, path in _NAMES.items()}
+)
+add_cases(
+    "release", "are the same file on some systems", {"manifest: case": add_line(SHARD.replace("teammate", "TEAMMATE"))}
+)
+add_cases("release", "not a file that a release may contain", {"manifest: code": add_line("sitecustomize.py")})
 _many = "".join(f"data/d/d/{number}.h5\n{number:064}  " for number in range(50_000)) + "data/d/d/last.h5"
-add("release", "listed in the manifest, but missing", {"manifest: many lines": add_line(_many)})
+add_cases("release", "listed in the manifest, but missing", {"manifest: many lines": add_line(_many)})
 
 for _file in (INFO, SHARD, policy_path):
     _label = _file if isinstance(_file, str) else "teammate"
-    add("release", "points outside the release", {f"link out: {_label}": replaced(_file, secret_link)})
-    add("release", "neither a file nor a folder", {f"pipe: {_label}": replaced(_file, named_pipe)})
+    add_cases("release", "points outside the release", {f"link out: {_label}": replace_file(_file, secret_link)})
+    add_cases("release", "neither a file nor a folder", {f"pipe: {_label}": replace_file(_file, named_pipe)})
     _too_large = r"expected at most|more than|truncated|twice|chunk table"
-    add("release", _too_large, {f"a terabyte: {_label}": replaced(_file, terabyte)})
+    add_cases("release", _too_large, {f"a terabyte: {_label}": replace_file(_file, terabyte_file)})
 
 
 def deep_folder(root: Path) -> None:
@@ -272,51 +276,55 @@ def deep_folder(root: Path) -> None:
 
 
 _folders = ("data", "meta")
-add(
+add_cases(
     "release",
     "points outside the release",
-    {f"folder linked out: {name}": replaced(name, folder_link) for name in _folders},
+    {f"folder linked out: {name}": replace_file(name, folder_link) for name in _folders},
 )
-add("release", "extra: not listed", {"unlisted pipe": replaced("extra", named_pipe)})
-add("release", "not listed in the manifest", {"folders too deep": deep_folder})
+add_cases("release", "extra: not listed", {"unlisted pipe": replace_file("extra", named_pipe)})
+add_cases("release", "not listed in the manifest", {"folders too deep": deep_folder})
 
 
 def _add_name_with_terminal_codes(root: Path) -> None:
     Path(os.fsdecode(os.fsencode(root) + b"/\x1b]0;owned\x07\xff")).touch()
 
 
-add("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes": _add_name_with_terminal_codes})
+add_cases("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes": _add_name_with_terminal_codes})
 
-add_hashed("matching regex", {"checkpoint's hash": set_theta(sha256="../../outside")})
+add_hashed_cases("matching regex", {"checkpoint's hash": set_theta(sha256="../../outside")})
 _paths = {"above": "../../outside", "absolute": "/etc", "backslash": "..\\..\\outside", "surrogate": "\ud800"}
-add_hashed(
+add_hashed_cases(
     "expected a path within", {f"checkpoint path: {name}": set_theta(checkpoint=path) for name, path in _paths.items()}
 )
 
 # Cases of extreme numbers, sizes and texts
 
 _integers = {"T": 2**62, "seed": 10**4000}
-add_hashed("Expected `int` <=", {f"large {name}": set_entry(**{name: value}) for name, value in _integers.items()})
-add_hashed("the index implies", {"rows: 2**39": set_entry(T=2**39)})
-add_hashed("histories", {"info: histories 2**62": change_info(histories=2**62)})
+add_hashed_cases(
+    "Expected `int` <=", {f"large {name}": set_entry(**{name: value}) for name, value in _integers.items()}
+)
+add_hashed_cases("the index implies", {"rows: 2**39": set_entry(T=2**39)})
+add_hashed_cases("histories", {"info: histories 2**62": change_info(histories=2**62)})
 _size = change_json(INFO, lambda value: value["shards"].update({SHARD: 2**61}))
-add_hashed(r"expected 2,305,843,009,213,693,952 bytes, found \d", {"info: shard of 2**61 bytes": _size})
-add_hashed("shards: expected", {"info: no shards": change_info(shards={})})
-_digits = file_with('{"format_version": ' + "9" * 10**6 + "}")
-add_hashed("malformed", {"info: deep": replaced(INFO, deep_json(100_000)), "info: digits": replaced(INFO, _digits)})
-add_hashed("SemVer", {"info: version with terminal codes": change_info(data_version="\x1b[2J")})
+add_hashed_cases(r"expected 2,305,843,009,213,693,952 bytes, found \d", {"info: shard of 2**61 bytes": _size})
+add_hashed_cases("shards: expected", {"info: no shards": change_info(shards={})})
+_digits = file_of('{"format_version": ' + "9" * 10**6 + "}")
+add_hashed_cases(
+    "malformed", {"info: deep": replace_file(INFO, deep_json(100_000)), "info: digits": replace_file(INFO, _digits)}
+)
+add_hashed_cases("SemVer", {"info: version with terminal codes": change_info(data_version="\x1b[2J")})
 
 
 _nested = json.loads("[" * 400 + "]" * 400)
 _deep_theta = change_lines(lambda values: values[0]["teammate"]["theta"].update(x=_nested), TASKS)
-_deep_files = {f"deep: {name}": replaced(name, deep_json(500)) for name in (INFO, PROVENANCE)}
-add_hashed("found more levels", _deep_files | {"tasks: deep theta": _deep_theta})
-_endless_line = file_with(b"a" * 2**24)
+_deep_files = {f"deep: {name}": replace_file(name, deep_json(500)) for name in (INFO, PROVENANCE)}
+add_hashed_cases("found more levels", _deep_files | {"tasks: deep theta": _deep_theta})
+_endless_line = file_of(b"a" * 2**24)
 for _of, _file in {"index": HISTORIES, "tasks": TASKS}.items():
-    add_hashed("expected at most", {f"{_of}: one endless line": replaced(_file, _endless_line)})
-add_hashed("line 1: ", {"index: a surrogate": set_entry(task_id="\ud800")})
-add_hashed("line 1: JSON is malformed", {"index: not a number": set_entry(score=float("nan"))})
-add_hashed("Expected `float` <", {"index: infinite": set_entry(return_end=1e308)})
+    add_hashed_cases("expected at most", {f"{_of}: one endless line": replace_file(_file, _endless_line)})
+add_hashed_cases("line 1: ", {"index: a surrogate": set_entry(task_id="\ud800")})
+add_hashed_cases("line 1: JSON is malformed", {"index: not a number": set_entry(score=float("nan"))})
+add_hashed_cases("Expected `float` <", {"index: infinite": set_entry(return_end=1e308)})
 
 # Cases of damaged chunk tables and chunks
 
@@ -341,7 +349,7 @@ def archived_table(path: Path, root: Path) -> None:
 
 
 def gigabyte_of_zeros() -> bytes:
-    """Return a deflated gigabyte of zeros in parts of 16 MiB; all parts but the first have equal bytes."""
+    """Return a gigabyte of zeros, compressed by DEFLATE in parts of 16 MiB; parts 2 to 64 have equal bytes."""
     compressor = zlib.compressobj(9)
     first, part = (compressor.compress(bytes(2**24)) + compressor.flush(zlib.Z_FULL_FLUSH) for _ in range(2))
     checksum = (2**30 % 65521) << 16 | 1  # Adler-32 checksum of a gigabyte of zeros
@@ -361,18 +369,24 @@ def inflating_chunk(root: Path) -> None:
 _HEADER = "{{'descr': {}, 'fortran_order': False, 'shape': {}, }}"
 _ROWS = str(CHUNK_DTYPE.descr)
 _TABLES = {
-    "2**50 rows": npy_header(_HEADER.format(_ROWS, f"({2**50},)")),
-    "long header": npy_header("{", b"\x03\x00", 2**32 - 1),
-    "objects": npy_header(_HEADER.format("[('offset', '|O'), ('size', '<u4')]", "(4,)")),
-    "calls": npy_header(_HEADER.format("__import__('os').system('true')", "(4,)")),
+    "2**50 rows": npy_header_only(_HEADER.format(_ROWS, f"({2**50},)")),
+    "long header": npy_header_only("{", b"\x03\x00", 2**32 - 1),
+    "objects": npy_header_only(_HEADER.format("[('offset', '|O'), ('size', '<u4')]", "(4,)")),
+    "calls": npy_header_only(_HEADER.format("__import__('os').system('true')", "(4,)")),
     "pickle": pickled_table,
     "archive": archived_table,
 }
-add_hashed("chunk table|expected rows of", {f"table: {name}": replaced(TABLE, make) for name, make in _TABLES.items()})
-add_hashed("found a larger one", {"table: huge chunks": table(lambda rows: rows["size"].__setitem__(0, 2**32 - 1))})
-add_hashed("cover|crc32", {"table: one offset": table(lambda rows: rows["offset"].__setitem__(slice(None), 0))})
-add_hashed("cannot be", {"table: no bytes": table(lambda rows: rows["size"].__setitem__(0, 0))})
-add_hashed("cannot be|twice", {"chunk that inflates to a gigabyte": inflating_chunk})
+add_hashed_cases(
+    "chunk table|expected rows of", {f"table: {name}": replace_file(TABLE, make) for name, make in _TABLES.items()}
+)
+add_hashed_cases(
+    "found a larger one", {"table: huge chunks": change_table(lambda rows: rows["size"].__setitem__(0, 2**32 - 1))}
+)
+add_hashed_cases(
+    "cover|crc32", {"table: one offset": change_table(lambda rows: rows["offset"].__setitem__(slice(None), 0))}
+)
+add_hashed_cases("cannot be", {"table: no bytes": change_table(lambda rows: rows["size"].__setitem__(0, 0))})
+add_hashed_cases("cannot be|twice", {"chunk that inflates to a gigabyte": inflating_chunk})
 
 # Cases of HDF5 structures that libhdf5 would follow, load or trust
 
@@ -388,7 +402,7 @@ def external_data(group: Any, out: Path) -> None:
 
 
 def filtered_data(group: Any, out: Path) -> None:
-    """Create a dataset whose filter libhdf5 would load from a plugin."""
+    """Create a dataset with a filter that libhdf5 would load from a plugin."""
     low: Any = h5py
     properties = low.h5p.create(low.h5p.DATASET_CREATE)
     properties.set_chunk((1, 120))
@@ -401,42 +415,42 @@ def add_external_link(file: Any, out: Path) -> None:
     file["0"]["more"] = h5py.ExternalLink(str(out / "secret.h5"), "/secret")
 
 
-def link_group_out(file: Any, out: Path) -> None:
+def replace_group_by_link(file: Any, out: Path) -> None:
     file.move("0", "kept")
     file["0"] = h5py.ExternalLink(str(out / "secret.h5"), "/")
 
 
 _SHARED: dict[str, dict[str, ChangeFile]] = {
     "point outside the file": {
-        "soft link": link(lambda out: h5py.SoftLink("/0/state")),
-        "link to a file": link(lambda out: h5py.ExternalLink(str(out / "secret.h5"), "/secret")),
-        "link to a pipe": link(lambda out: h5py.ExternalLink(str(out / "pipe"), "/secret")),
+        "soft link": link_actions(lambda out: h5py.SoftLink("/0/state")),
+        "link to a file": link_actions(lambda out: h5py.ExternalLink(str(out / "secret.h5"), "/secret")),
+        "link to a pipe": link_actions(lambda out: h5py.ExternalLink(str(out / "pipe"), "/secret")),
     },
     "in other files|local heap": {"external storage": set_actions(external_data), "virtual": set_actions(virtual_data)},
     r"filters \[32004\]|found \(\[32004\]": {"a plugin's filter": set_actions(filtered_data)},
     "expected numbers": {
-        "texts": typed_actions(h5py.string_dtype()),
-        "references": typed_actions(h5py.ref_dtype),
-        "records": typed_actions([("a", "i4"), ("b", "i4")]),
+        "texts": actions_of_type(h5py.string_dtype()),
+        "references": actions_of_type(h5py.ref_dtype),
+        "records": actions_of_type([("a", "i4"), ("b", "i4")]),
     },
-    "groups: expected|point outside the file": {"group linked out": link_group_out},
+    "groups: expected|point outside the file": {"group linked out": replace_group_by_link},
 }
 """Message -> changes of the first group, of shards and of published files."""
 _OF_SHARDS: dict[str, dict[str, ChangeFile]] = {
-    "expected": {"endless rows": new_dataset((2**50,), chunks=(120,), compression="gzip")},
-    "chunks": {"huge chunks": new_dataset(chunks=(1, 2**30), maxshape=(4, None), compression="gzip")},
+    "expected": {"endless rows": actions_dataset((2**50,), chunks=(120,), compression="gzip")},
+    "chunks": {"huge chunks": actions_dataset(chunks=(1, 2**30), maxshape=(4, None), compression="gzip")},
     "not a dataset|expected": {"circle of groups": set_actions(lambda group, out: group.__setitem__("actions", group))},
     r"expected \[.*found \[.*'more'": {"one name more": add_external_link},
     "attribute": {"attribute of texts": lambda file, out: file.attrs.create("layout", ["x"] * 9)},
 }
 for _message, _changes in (_SHARED | _OF_SHARDS).items():
-    add_hashed(_message, {f"shard: {name}": hdf5(change) for name, change in _changes.items()})
+    add_hashed_cases(_message, {f"shard: {name}": change_hdf5(change) for name, change in _changes.items()})
 
 # Cases of published files
 
 
 def endless_history(root: Path) -> None:
-    """Give all datasets and the index line of the first published history 2**39 rows."""
+    """Change the first published history to 2**39 rows, in all its datasets and in the index."""
     set_entry("histories_index.jsonl", T=2**39)(root)
     with h5py.File(root / "histories.h5", "r+") as file:
         group: Any = file["0"]
@@ -456,32 +470,44 @@ def inflating_published_chunks(file: Any, out: Path) -> None:
 
 _H5, _INDEX = "histories.h5", "histories_index.jsonl"
 for _message, _changes in _SHARED.items():
-    _spoils = {name: hdf5(change, _H5) for name, change in _changes.items()}
-    add("published", f"group /0.*({_message})|cannot be read: .*{_message}", _spoils)
+    _spoils = {name: change_hdf5(change, _H5) for name, change in _changes.items()}
+    add_cases("published", f"group /0.*({_message})|cannot be read: .*{_message}", _spoils)
 _PUBLISHED = (_H5, _INDEX)
-for _message, _make in {"points outside": secret_link, "neither a file": named_pipe, "at most|HDF5": terabyte}.items():
-    add("published", _message, {f"{_make.__name__}: {name}": replaced(name, _make) for name in _PUBLISHED})
-_endless = hdf5(new_dataset((2**39,), "i4", chunks=(4096,), compression="gzip"), _H5)
-add("published", "expected numbers of shape", {"endless rows": _endless})
-add("published", "cannot contain the declared|memory", {"endless history": endless_history})
-add(
-    "published", "contradicts the|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published_chunks, _H5)}
+for _message, _make in {
+    "points outside": secret_link,
+    "neither a file": named_pipe,
+    "at most|HDF5": terabyte_file,
+}.items():
+    add_cases("published", _message, {f"{_make.__name__}: {name}": replace_file(name, _make) for name in _PUBLISHED})
+_endless = change_hdf5(actions_dataset((2**39,), "i4", chunks=(4096,), compression="gzip"), _H5)
+add_cases("published", "expected numbers of shape", {"endless rows": _endless})
+add_cases("published", "cannot contain the declared|memory", {"endless history": endless_history})
+add_cases(
+    "published",
+    "contradicts the|inflate",
+    {"chunk that inflates to a gigabyte": change_hdf5(inflating_published_chunks, _H5)},
 )
-add("published", "Expected `int` >= 1", {"rows below zero": set_entry(_INDEX, T=-5)})
-add("published", "missing", {"group above": set_entry(_INDEX, h5_group="../0")})
-add("published", "lite", {"circle of groups": hdf5(lambda file, out: file["0"].__setitem__("a", file["0"]), _H5)})
-add("published", "printable", {"task id of surrogates": set_entry(_INDEX, task_id="\ud800")})
-add("published", "expected at most", {"one endless line": replaced(_INDEX, _endless_line)})
+add_cases("published", "Expected `int` >= 1", {"rows below zero": set_entry(_INDEX, T=-5)})
+add_cases("published", "missing", {"group above": set_entry(_INDEX, h5_group="../0")})
+add_cases(
+    "published", "lite", {"circle of groups": change_hdf5(lambda file, out: file["0"].__setitem__("a", file["0"]), _H5)}
+)
+add_cases("published", "printable", {"task id of surrogates": set_entry(_INDEX, task_id="\ud800")})
+add_cases("published", "expected at most", {"one endless line": replace_file(_INDEX, _endless_line)})
 
 # Cases of faulty servers
 
-add("served", "expected at most", {f"a terabyte: {name}": replaced(name, terabyte) for name in (MANIFEST, TABLE)})
-add("served", "expected at most|sha256", {"a terabyte: shard": replaced(SHARD, terabyte)})
-add("served", "points outside the release", {"names above": add_line("../../new")})
+add_cases(
+    "served",
+    "expected at most",
+    {f"a terabyte: {name}": replace_file(name, terabyte_file) for name in (MANIFEST, TABLE)},
+)
+add_cases("served", "expected at most|sha256", {"a terabyte: shard": replace_file(SHARD, terabyte_file)})
+add_cases("served", "points outside the release", {"names above": add_line("../../new")})
 for _name, _message, _rules in (
-    ("endless manifest", "MANIFEST", {"*/MANIFEST.sha256": Long(TERABYTE)}),
-    ("endless index", "expected at most|sent more|says", {f"*/{HISTORIES}": Long(TERABYTE)}),
-    ("endless shard", "expected at most", {"*.h5": Long(TERABYTE)}),
+    ("endless manifest", "MANIFEST", {"*/MANIFEST.sha256": LongBody(TERABYTE)}),
+    ("endless index", "expected at most|sent more|says", {f"*/{HISTORIES}": LongBody(TERABYTE)}),
+    ("endless shard", "expected at most", {"*.h5": LongBody(TERABYTE)}),
     ("to a local file", "info.json", {f"*/{INFO}": Redirect("file:///etc/passwd")}),
     ("to another protocol", "h5", {"*.h5": Redirect("ftp://127.0.0.1/x")}),
     ("in a circle", "info.json", {f"*/{INFO}": Redirect(f"/{INFO}")}),

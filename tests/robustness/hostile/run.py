@@ -38,7 +38,7 @@ MEMORY = 3 * 2**30
 SECONDS = 60
 
 _BOUND = ExitStack()
-LARGE = 2**26  # bytes; larger files are not searched for the secret
+LARGE = 2**26  # size in bytes; files of this size or more are not searched for the secret
 Steps = dict[str, Callable[[], Any]]
 
 
@@ -61,8 +61,8 @@ def make_release(root: Path) -> None:
     write_release(root, "lite", tasks, data_version="0.0.1", card="# hostile\n", kept_steps=20)
 
 
-def make_outside(folder: Path) -> None:
-    """Create the files that no release may touch or reveal."""
+def make_outside_files(folder: Path) -> None:
+    """Create files outside the release, which readers of the release must neither touch nor reveal."""
     folder.mkdir()
     (folder / "secret.txt").write_text(SECRET)
     (folder / "policy.json").write_text(SECRET)
@@ -84,7 +84,7 @@ def file_states(folder: Path) -> dict[str, tuple]:
 
 
 def run_step(step: Callable[[], Any]) -> dict[str, Any]:
-    """Run a step; return its output or error message, and whether it raised only package errors."""
+    """Run an operation; return its output or error message, and whether it raised only package errors."""
     try:
         with time_limit(SECONDS):
             ours, text = True, str(step() or "")
@@ -130,8 +130,8 @@ def download_release(root: Path, out: Path, case: Case) -> None:
         fetch_planned(plan_download(server.url, to=out / "mirror"))
 
 
-def steps_of(case: Case, root: Path, out: Path) -> Steps:
-    """Return the operations to run on a hostile input, by name."""
+def case_steps(case: Case, root: Path, out: Path) -> Steps:
+    """Return a dict from name to function: the operations to run on a hostile input."""
     if case.kind == "served":
         return {"download": lambda: download_release(root, out, case)}
     if case.kind == "published":
@@ -151,16 +151,16 @@ def steps_of(case: Case, root: Path, out: Path) -> Steps:
 
 
 def run_in_folder(folder: Path, base: Path, case: Case) -> dict[str, Any]:
-    """Run all steps of a case; return their outcomes, whether files changed, leaked secrets and written bytes."""
+    """Run all operations of a case; return their outcomes, changes of input files, leaks and written bytes."""
     folder.mkdir()
     root, out = folder / "root", folder / "out"
     shutil.copytree(base, root)
-    make_outside(folder / "outside")
+    make_outside_files(folder / "outside")
     out.mkdir()
     case.spoil(root)
     before = file_states(root), file_states(folder / "outside"), sorted(folder.iterdir())
     os.chdir(out)
-    outcomes = {name: run_step(step) for name, step in steps_of(case, root, out).items()}
+    outcomes = {name: run_step(step) for name, step in case_steps(case, root, out).items()}
     touched = before != (file_states(root), file_states(folder / "outside"), sorted(folder.iterdir()))
     written = [out / name for name in files_below(out)]
     leaked = [str(path) for path in written if path.is_symlink() or not path.is_file() or _contains_secret(path)]
@@ -176,13 +176,13 @@ def _contains_secret(path: Path) -> bool:
 
 
 def make_valid_inputs(folder: Path) -> None:
-    """Write a valid release and valid published files, copies of which the hostile cases damage."""
+    """Write a valid release and valid published files; hostile cases damage copies of these."""
     make_release(folder / "release")
     to_published(load_icrl4aht(folder / "release"), folder / "published")
 
 
-def bound_process() -> None:
-    """Limit the memory, the size of downloads and the waits before retries of this process; warnings are errors."""
+def limit_process() -> None:
+    """Limit this process's memory, downloads and waits before retries, and turn warnings into errors."""
     warnings.simplefilter("error")
     clients._WAITS = (0.01, 0.01, 0.01)
     files.LARGEST = LARGE
@@ -190,6 +190,6 @@ def bound_process() -> None:
 
 
 def run_case(folder: Path, name: str) -> dict[str, Any]:
-    """Run the case of this name in a folder that `make_valid_inputs` has filled."""
+    """Run the hostile case of a given name in a folder that `make_valid_inputs` has filled."""
     base = folder / ("published" if CASES[name].kind == "published" else "release")
     return run_in_folder(folder / "case", base, CASES[name])
