@@ -147,12 +147,12 @@ def test_imitation_loss_makes_the_actions_of_the_script_likelier(trainer, compil
     for weight in (0.0, 5.0):
         params, optimizer = jax.tree.map(jnp.copy, (state.params, state.optimizer))
         losses = []
-        for _ in range(10):
+        for _ in range(6):
             learned = trainer._learn(params, optimizer, (played,), jax.random.key(1), jnp.float32(weight))
             params, optimizer, log = learned
             losses.append(float(log["imitation_loss"]))
         fallen[weight] = losses[0] - losses[-1]
-    assert fallen[5.0] > 0.1
+    assert fallen[5.0] > 0.05, "in the six updates before the learning rate is 0"
     assert fallen[0.0] < fallen[5.0] / 4
 
 
