@@ -76,7 +76,7 @@ bench-loader: install ## windows/s of each cache compared with readers of the pu
 bench-learn: install ## speed of learning egos and of training and playing sequence models, JSON lines; PEER= as for bench-env
 	$(BIN)/python -m benchmarks.bench_learn $(if $(PEER),--peer $(PEER)) $(OPTIONS)
 
-bench-gpu: install ## learners, training, loader, acting on a GPU in at most 9 minutes; tiny sizes on a CPU, JSON lines
+bench-gpu: install ## learners, training, acting on a GPU in at most 9 minutes; tiny sizes on a CPU, JSON lines
 	$(BIN)/python -m benchmarks.bench_gpu $(OPTIONS)
 
 bench-collect: install ## collection: speed, memory, bytes a transition, compared with the paper's format, JSON lines

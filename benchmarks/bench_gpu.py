@@ -4,19 +4,17 @@
     product    TFLOP/s of one large matrix product; float32 products use TF32 on a GPU by default, see `measure_product`
     learner    steps/s of PPO training of an ego with teammate H4, with the paper's network, in 1,024 environments
     train      seconds of an AD training step (B = 1024, L = 500 for the paper's small size), and wait for the loader
-    loader     batches/s from the bundled release to the device, without training
     act        steps/s of the evaluator with cached acting, on the tasks of one layout
-    attention  time of attention in training (forward and backward), compared with attention of JAX and cuDNN
 
-One JSON line is printed for each case. Cases run in a child process, and in a new one after each failure. At the time
-limit, the running case is stopped and the other cases are skipped, each with a line. Learners run in a separate process
-with XLA's deterministic operations, as in `generate`. Models are untrained.
+One JSON line is printed for each case, with the error if the case fails. At the time limit the process ends, with a
+line for each case without a result. Learners use XLA's deterministic operations, as in `generate`. Models are
+untrained.
 
 `mfu` is the model FLOP utilisation: matrix-product operations per second of a step, including the backward pass, see
 `benchmarks.harness.product_flops`, divided by the speed of the large product with the same dtype. The encoder `words`
 computes equal observations of a batch once, but its operations are counted as if all observations differed.
-`program_gib` is the memory that the compiler planned for a program, `process_peak_gib` the process's peak memory, and
-`accumulate` the number of parts that a batch is divided into to fit into memory.
+`program_gib` is the memory that the compiler planned for a program, `process_peak_gib` the process's peak memory since
+the first case, and `accumulate` the number of parts that a batch is divided into to fit into memory.
 """
 
 from __future__ import annotations
@@ -30,8 +28,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache, partial
-from itertools import groupby, islice
+from itertools import islice
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import click
@@ -40,25 +39,20 @@ import jax.numpy as jnp
 from icrl4aht_baselines.agents.egos import trained_policy
 from icrl4aht_baselines.evaluate.evaluator import play_episodes, prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
-from icrl4aht_baselines.methods.attention import causal_attention
-from icrl4aht_baselines.methods.method import Method
-from icrl4aht_baselines.methods.options import SIZES, ModelOptions
-from icrl4aht_baselines.methods.registry import get_method, overcooked_world
+from icrl4aht_baselines.methods.options import SIZES
 from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_baselines.training.trainer import Trainer
-from icrl4aht_generation.jobs.options import request_determinism
 from icrl4aht_generation.learners.config import EncoderKind, PPOConfig, Widths
 from icrl4aht_generation.learners.ego import Learner, compiled_update
-from icrl4aht_generation.learners.resume import xla_threads
+from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.teammates.instances import published_tasks
 from jax.extend.backend import get_backend
-from jaxlib import version as jaxlib_version
 
-from benchmarks.bench_learn import heuristic_learner, size_options
-from benchmarks.harness import compile_measured, elapsed, print_line, run_isolated
+from benchmarks.bench_learn import ad_method, heuristic_learner
+from benchmarks.harness import compile_measured, elapsed, print_line
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.system import usable_cores
 
 _LAYOUT = "demo_wide"
@@ -74,7 +68,6 @@ class Sizes:
         ppo: hyper-parameters of the learner, except the encoder of its network.
         batch: B, batch size in training.
         length: upper limit of L in training and of K in acting.
-        shrunk: name of a model size -> values that replace those of `SIZES`.
         episode_steps: steps of an episode in acting.
         tasks: largest number of tasks in acting.
         seconds: minimum duration of a measurement, after compilation.
@@ -84,7 +77,6 @@ class Sizes:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     batch: int = 1024
     length: int = 500
-    shrunk: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     episode_steps: int = 100
     tasks: int = 20
     seconds: float = 4.0
@@ -100,7 +92,6 @@ SMALL_SIZES = Sizes(
     ppo=PPOConfig(environments=4, rollout=8, minibatches=2),
     batch=2,
     length=16,
-    shrunk={"small": {"layers": 1, "width": 32}, "tiny": {"layers": 1, "width": 16}},
     episode_steps=10,
     tasks=2,
     seconds=0.05,
@@ -148,13 +139,11 @@ def describe_device(sizes: Sizes) -> dict[str, Any]:
     return {
         "device": devices[0].device_kind,
         "devices": len(devices),
-        "platform": " ".join(get_backend().platform_version.split()),
-        "jax": jax.__version__,
-        "jaxlib": jaxlib_version.__version__,
+        "platform_version": " ".join(get_backend().platform_version.split()),
+        **software_versions(),
         "commit": commit.stdout.strip() or None,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "cores": usable_cores(),
-        "xla_threads": xla_threads(),
         "sizes": "full" if sizes.product == FULL_SIZES.product else "small",
         **device_memory(),
     }
@@ -173,7 +162,7 @@ def measure_learner(sizes: Sizes, encoder: EncoderKind) -> dict[str, Any]:
     learner = ego_learner(sizes, encoder)
     config = learner.config
     state = jax.jit(learner.init)(jax.random.key(0))
-    program = compile_measured(compiled_update(learner), state)
+    program = compile_measured(compiled_update(learner), state, xla_gpu_deterministic_ops=True)
 
     def update() -> Any:
         nonlocal state
@@ -190,7 +179,6 @@ def measure_learner(sizes: Sizes, encoder: EncoderKind) -> dict[str, Any]:
         "mfu": sizes.mfu(program.flops, seconds, "float32"),
         "program_gib": gib(program.bytes),
         **device_memory(),
-        "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
 
 
@@ -209,11 +197,11 @@ def measure_training(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) 
 
 
 def _training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, parts: int) -> dict[str, Any]:
-    model = architecture(sizes, size, encoder, dtype)
     length = context_length(sizes, size)
     dataset = load_icrl4aht(split="train", source="ppo", layout=_LAYOUT, obs="state")
     options = TrainOptions(batch_size=sizes.batch, context=length, accumulate=parts)
-    trainer = Trainer(ad_method(model, dataset.layouts), options)
+    method = ad_method(size, dataset.layouts, encoder=encoder, bfloat16=dtype == "bfloat16")
+    trainer = Trainer(method, options)
     state = trainer.init()
     with trainer.batches(dataset.ad(batch_size=sizes.batch, length=length, seed=0), 0, sys.maxsize) as batches:
         batch = next(batches)
@@ -249,28 +237,12 @@ def _training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, p
     }
 
 
-def measure_loader(sizes: Sizes, size: str) -> dict[str, Any]:
-    """Measure the seconds per batch for loading state records from the bundled release to the device."""
-    device = jax.devices()[0]
-    sampler = load_icrl4aht(split="train", source="ppo", layout=_LAYOUT, obs="state").ad(
-        batch_size=sizes.batch, length=context_length(sizes, size), seed=0
-    )
-    with sampler.batches(device=device) as batches:
-        seconds = statistics.median(seconds_of_calls(partial(next, batches), sizes.seconds))
-    return {
-        "batch": sizes.batch,
-        "length": sampler.length,
-        "batch_seconds": round(seconds, 5),
-        "transitions_per_second": round(sizes.batch * sampler.length / seconds),
-    }
-
-
 def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) -> dict[str, Any]:
     """Measure the evaluator's speed with full windows: steps/s of all tasks and seeds, and milliseconds per step."""
     context = context_length(sizes, size)
     layout = get_layout(_LAYOUT)
     tasks = h4_tasks()[: sizes.tasks]
-    method = ad_method(architecture(sizes, size, encoder, "float32"), [layout])
+    method = ad_method(size, [layout], encoder=encoder)
     policy = trained_policy(method, method.init(jax.random.key(0)), context)
     protocol = replace(PROTOCOLS["seeded"], steps=sizes.episode_steps, episodes=sys.maxsize)
     started = time.perf_counter()
@@ -292,33 +264,6 @@ def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) ->
     }
 
 
-def measure_attention(sizes: Sizes) -> dict[str, Any]:
-    """Measure milliseconds of attention, forward and backward in bfloat16, for three implementations.
-
-    The implementations are that of our models, JAX's `dot_product_attention`, and the same function with cuDNN.
-    """
-    small = SIZES["small"]
-    shape = (sizes.batch, sizes.length, small.heads, small.width // small.heads)
-    q, k, v = jax.random.normal(jax.random.key(0), (3, *shape), jnp.bfloat16)
-    library = partial(jax.nn.dot_product_attention, is_causal=True)
-    ways: dict[str, Callable[..., Any]] = {
-        "models": causal_attention,
-        "jax": library,
-        "cudnn": partial(library, implementation="cudnn"),
-    }
-    facts: dict[str, Any] = {"shape": shape}
-    for name, attend in ways.items():
-        gradient = jax.jit(jax.grad(lambda *x, attend=attend: attend(*x).astype(jnp.float32).sum(), (0, 1, 2)))
-        try:
-            seconds = seconds_of_calls(partial(gradient, q, k, v), sizes.seconds / 4)
-            facts[f"{name}_milliseconds"] = round(1e3 * statistics.median(seconds), 4)
-        except Exception as error:  # cuDNN may be missing or too old, or may not support the shape
-            if name == "models":
-                raise
-            facts[f"{name}_error"] = short_message(error)
-    return facts
-
-
 def h4_tasks() -> list[Task]:
     """Return the test tasks with H4 teammates on the measured layout."""
     tasks = published_tasks("teammate")
@@ -330,25 +275,9 @@ def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
     return heuristic_learner(get_layout(_LAYOUT), replace(sizes.ppo, widths=Widths(encoder=encoder)))
 
 
-def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:
-    """Return AD's architecture for the name of a model size."""
-    changes = {**sizes.shrunk.get(size, {}), "encoder": encoder, "bfloat16": dtype == "bfloat16"}
-    return size_options(size, **changes)
-
-
-def ad_method(model: ModelOptions, layouts: Sequence[Layout]) -> Method:
-    """Return the method AD for batches of state records on some layouts."""
-    return get_method("ad")(model, overcooked_world(layouts, model.encoder))
-
-
 def context_length(sizes: Sizes, size: str) -> int:
     """Return AD's window length, which is L in training and K in acting, for the name of a model size."""
-    return min(sizes.length, SIZES[size].context)
-
-
-def short_message(error: BaseException) -> str:
-    """Return text with an error's class and the start of its message."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"[:400]
+    return min(sizes.length, SIZES[size].train["context"])
 
 
 CASES: dict[str, Callable[[Sizes], dict[str, Any]]] = {
@@ -361,90 +290,64 @@ CASES: dict[str, Callable[[Sizes], dict[str, Any]]] = {
     "train/small/paper/float32": partial(measure_training, size="small", encoder="paper", dtype="float32"),
     "act/small": partial(measure_acting, size="small", encoder="paper", seeds=1),
     "act/tiny": partial(measure_acting, size="tiny", encoder="mlp", seeds=1),
-    "loader/small": partial(measure_loader, size="small"),
-    "loader/tiny": partial(measure_loader, size="tiny"),
     "train/small/words/bfloat16": partial(measure_training, size="small", encoder="words", dtype="bfloat16"),
     "train/small/words/float32": partial(measure_training, size="small", encoder="words", dtype="float32"),
     "train/tiny/mlp/bfloat16": partial(measure_training, size="tiny", encoder="mlp", dtype="bfloat16"),
     "train/tiny/mlp/float32": partial(measure_training, size="tiny", encoder="mlp", dtype="float32"),
     "act/tiny/16": partial(measure_acting, size="tiny", encoder="mlp", seeds=16),
-    "attention": measure_attention,
 }
 """Name of a case, "part" or "part/..", -> function that measures it, in running order, least important last."""
 
 PARTS = tuple(dict.fromkeys(name.split("/")[0] for name in CASES))
 
 
-def run_here(names: Sequence[str], make_sizes: Callable[[], Sizes]) -> bool:
-    """Run cases in this process until one fails, and print a line for each. Return whether all succeeded."""
-    for name in names:
-        try:
-            facts = CASES[name](make_sizes())
-        except Exception as error:
-            print_case(name, {"error": short_message(error)})
-            return False
-        print_case(name, facts)
+def run_case(name: str, sizes: Sizes) -> bool:
+    """Measure a case, and print its line. Return whether it succeeded."""
+    try:
+        facts = CASES[name](sizes)
+    except Exception as error:  # the other cases are measured even so
+        print_case(name, {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"[:400]})
+        return False
+    print_case(name, facts)
     return True
 
 
 def print_case(case: str, facts: Mapping[str, Any]) -> None:
     """Print the JSON line of a case."""
-    print_line(**{"benchmark": "gpu", "case": case, **facts})
+    print_line("gpu", case=case, **facts)
     sys.stdout.flush()
+
+
+def stop_at_limit(pending: Sequence[str]) -> None:
+    """Print a line for each case without a result, then end the process, as a running case cannot be interrupted."""
+    for name in pending:
+        print_case(name, {"error": "no time left"})
+    os._exit(1)
 
 
 @click.command()
 @click.option("--part", "parts", multiple=True, type=click.Choice(PARTS), default=PARTS, help="Measure these parts.")
 @click.option("--case", "cases", multiple=True, type=click.Choice(list(CASES)), help="Measure these cases only.")
 @click.option("--minutes", type=float, default=9.0, show_default=True, help="Time limit of the command.")
-@click.option("--case-minutes", type=float, default=3.0, show_default=True, help="Time limit of a case.")
 @click.option("--small", is_flag=True, help="Use tiny sizes, as always on a CPU.")
 @click.option("--seconds", type=float, help="Least time of a measurement.  [default: 4, or 0.05 for tiny sizes]")
-@click.option("--here", is_flag=True, help="Measure in this process, up to the first failure; no time limits.")
-def main(
-    parts: tuple[str, ...], cases: tuple[str, ...], minutes: float, case_minutes: float, here: bool, **settings: Any
-) -> None:
+def main(parts: tuple[str, ...], cases: tuple[str, ...], minutes: float, small: bool, seconds: float | None) -> None:
     """Measure the speed of learning, training and evaluation on a GPU, and print a JSON line for each case."""
-    started = time.monotonic()
-    names = [name for name in CASES if (name in cases if cases else name.split("/")[0] in parts)]
-    learning = [name for name in names if name.startswith("learner/")]
-    if here:
-        if learning == names:
-            request_determinism()  # deterministic operations, as in `generate`
-        sys.exit(0 if run_here(names, partial(chosen_sizes, **settings)) else 1)
-    failures = 0
-    for _, group in groupby(names, key=lambda name: name in learning):
-        failures += run_isolated(
-            list(group),
-            lambda names: [sys.executable, "-m", "benchmarks.bench_gpu", "--here", *child_options(names, **settings)],
-            print_case,
-            until=started + 60 * minutes,
-            case_seconds=60 * case_minutes,
-            environment=child_environment(),
-        )
-    sys.exit(1 if failures else 0)
-
-
-def child_environment() -> dict[str, str]:
-    """Return the environment variables of child processes, which let JAX use 92 % of the GPU memory."""
-    names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")  # JAX accepts only one
-    return {**os.environ, **({} if any(name in os.environ for name in names) else {names[0]: "0.92"})}
-
-
-def chosen_sizes(small: bool, seconds: float | None) -> Sizes:
-    """Return the sizes of the measurements, which are small on request or on a CPU. This call initialises JAX."""
+    pending = [name for name in CASES if (name in cases if cases else name.split("/")[0] in parts)]
+    limit = Timer(60 * minutes, stop_at_limit, [pending])
+    limit.daemon = True  # an interrupted command ends at once
+    limit.start()
     sizes = FULL_SIZES
     if small or jax.default_backend() == "cpu":
         sizes = SMALL_SIZES
         jax.config.update("jax_disable_most_optimizations", True)  # otherwise compilation takes nearly all of the time
-    return replace(sizes, seconds=sizes.seconds if seconds is None else seconds)
-
-
-def child_options(names: Sequence[str], small: bool, seconds: float | None) -> list[str]:
-    """Return the command-line options of a child process that measures some cases with the same settings."""
-    options = [word for name in names for word in ("--case", name)]
-    options += ["--seconds", str(seconds)] if seconds is not None else []
-    return options + ["--small"] * small
+    sizes = replace(sizes, seconds=sizes.seconds if seconds is None else seconds)
+    failed = False
+    while pending:
+        failed |= not run_case(pending[0], sizes)
+        del pending[0]  # after the case, so that `stop_at_limit` also prints a line for a running case
+    limit.cancel()
+    sys.exit(int(failed))
 
 
 if __name__ == "__main__":

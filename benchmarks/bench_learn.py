@@ -28,9 +28,10 @@ from icrl4aht_baselines.agents.egos import Acting, PlayMode, trained_policy
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_episodes, prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, Protocol
 from icrl4aht_baselines.methods.ad import dropped_steps
+from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
-from icrl4aht_baselines.methods.tokens import plain_view
+from icrl4aht_baselines.methods.tokens import BatchView, plain_view
 from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_baselines.training.trainer import Trainer
 from icrl4aht_generation.env import Environment
@@ -135,9 +136,10 @@ def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
         i += 1
 
 
-def size_options(size: str, **changes: Any) -> ModelOptions:
-    """Return AD's architecture for the name of a model size."""
-    return ModelOptions(**SIZES[size].model | changes)
+def ad_method(size: str, layouts: Sequence[Layout], view: BatchView | None = None, **changes: Any) -> Method:
+    """Return the method AD of a model size on some layouts, perhaps with other options of the model."""
+    model = ModelOptions(**SIZES[size].model | changes)
+    return get_method("ad")(model, overcooked_world(layouts, model.encoder, view))
 
 
 def training_steps(trainer: Trainer, batches: Iterator[Any], steps: int) -> Callable[[], None]:
@@ -164,8 +166,8 @@ def compare_training(
         to_published(dataset, Path(folder) / "published", states=False)
         for way in ("published", *encoders):
             encoder: EncoderKind = "paper" if way == "published" else way
-            world = overcooked_world(dataset.layouts, encoder, plain_view if way == "published" else None)
-            trainer = Trainer(get_method("ad")(size_options(size, encoder=encoder), world), options)
+            view = plain_view if way == "published" else None
+            trainer = Trainer(ad_method(size, dataset.layouts, view, encoder=encoder), options)
             if way == "published":
                 found = published_batches(Path(folder) / "published", sampler)
                 batches = (jax.device_put(batch, trainer.rows) for batch in found)
@@ -180,9 +182,8 @@ def compare_training(
 
 def untrained_ad(layout: Layout, size: str, acting: Acting) -> Policy:
     """Return an untrained AD model as an ego."""
-    model = size_options(size)
-    method = get_method("ad")(model, overcooked_world([layout], model.encoder))
-    return trained_policy(method, method.init(jax.random.key(0)), SIZES[size].context, PlayMode(acting))
+    method = ad_method(size, [layout])
+    return trained_policy(method, method.init(jax.random.key(0)), SIZES[size].train["context"], PlayMode(acting))
 
 
 def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -> Callable[[], None]:
@@ -191,7 +192,7 @@ def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -
     policy = untrained_ad(tasks[0].layout, size, acting)
     episodes = play_episodes(prepare_rollout(lambda layout: policy, tasks, protocol))
     # Windows must be full for cached acting, because exact acting always computes all K positions.
-    for _ in range(-(-SIZES[size].context // steps) if acting == "cached" else 1):
+    for _ in range(-(-SIZES[size].train["context"] // steps) if acting == "cached" else 1):
         next(episodes)
     return lambda: jax.block_until_ready(next(episodes))
 
@@ -199,7 +200,7 @@ def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -
 def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int) -> None:
     """Print steps/s of cached acting on some tasks of a layout, and the ratio to exact acting."""
     tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
-    dropped = dropped_steps(SIZES[size].context)  # number of steps after which the window is computed again
+    dropped = dropped_steps(SIZES[size].train["context"])  # number of steps after which the window is computed again
     lengths: dict[Acting, int] = {"cached": dropped * -(-10 * steps // dropped), "exact": steps}
     ways = {acting: acting_steps(tasks, size, acting, n) for acting, n in lengths.items()}
     rates = rates_in_turn(ways, {acting: n * len(tasks) for acting, n in lengths.items()}, rounds)

@@ -1,4 +1,4 @@
-"""Helpers of the benchmarks: JSON lines, comparisons with a peer in rounds, child processes, and FLOP counts.
+"""Helpers of the benchmarks: JSON lines, comparisons with a peer in rounds, and FLOP counts.
 
 Compared implementations take turns in rounds, so that the load of the machine is similar for all of them. A reported
 ratio is the median over rounds of the ratio within a round.
@@ -10,11 +10,9 @@ import json
 import math
 import resource
 import statistics
-import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from threading import Timer
 from typing import Any, NamedTuple
 
 import click
@@ -86,11 +84,11 @@ class MeasuredProgram(NamedTuple):
     bytes: int
 
 
-def compile_measured(function: Any, *arguments: Any) -> MeasuredProgram:
-    """Compile a jitted function for some arguments, and measure its costs."""
+def compile_measured(function: Any, *arguments: Any, **options: Any) -> MeasuredProgram:
+    """Compile a jitted function for some arguments with options of XLA, and measure its costs."""
     started = time.perf_counter()
     traced = function.trace(*arguments)
-    compiled = traced.lower().compile()
+    compiled = traced.lower().compile(compiler_options=options)
     seconds = time.perf_counter() - started
     memory, planned = compiled.memory_analysis(), 0
     if memory is not None:
@@ -129,61 +127,6 @@ def _inner_programs(params: dict[str, Any]) -> Iterator[Any]:
         for part in value if isinstance(value, (tuple, list)) else (value,):
             if hasattr(part, "eqns") or hasattr(getattr(part, "jaxpr", None), "eqns"):
                 yield part
-
-
-PrintFacts = Callable[[str, Mapping[str, Any]], None]
-"""Function that prints the line of a case, called with the name of the case and its facts."""
-
-
-def run_isolated(
-    cases: Sequence[str],
-    command: Callable[[Sequence[str]], list[str]],
-    print_facts: PrintFacts,
-    *,
-    until: float,
-    case_seconds: float,
-    environment: Mapping[str, str] | None = None,
-) -> int:
-    """Run cases in a child process, and in a new one after each failure. Return the number of failures.
-
-    A crash or an out-of-memory error therefore affects only one case. A child runs its cases in order, and prints a
-    JSON object for each to stdout, with the name as "case". A child ends after a case with "error". If a child crashes
-    or is stopped, a line is also printed for the case without a result.
-
-    Args:
-        cases: names of the cases.
-        command: function from names of cases to the command line of a child that runs them.
-        print_facts: function that prints the line of a case.
-        until: value of `time.monotonic()` at which the running child is killed, and after which none is started.
-        case_seconds: time limit of a single case, including the start of its process.
-        environment: environment variables of the children; inherited by default.
-    """
-    pending, failures = list(cases), 0
-    while pending and time.monotonic() < until:
-        failed, stopped, line, left = False, False, " ", 0.0
-        with subprocess.Popen(command(pending), stdout=subprocess.PIPE, text=True, env=environment) as child:
-            assert child.stdout is not None
-            while line:
-                left = until - time.monotonic()
-                timer = Timer(max(0.0, min(left, case_seconds)), child.kill)
-                timer.start()
-                line = child.stdout.readline()
-                stopped = not timer.is_alive()
-                timer.cancel()
-                if line.startswith("{"):  # other output is ignored
-                    facts = json.loads(line)
-                    failed = "error" in facts
-                    print_facts(pending.pop(0), {name: value for name, value in facts.items() if name != "case"})
-        if pending and not failed:
-            why = f"the process ended with code {child.returncode}"
-            if stopped:
-                why = "stopped: no time left" if left < case_seconds else f"stopped after {case_seconds:.0f} s"
-            print_facts(pending.pop(0), {"error": why})
-            failed = True
-        failures += failed
-    for case in pending:
-        print_facts(case, {"skipped": "no time left"})
-    return failures
 
 
 def folder_size(folder: Path) -> int:

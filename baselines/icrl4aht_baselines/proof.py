@@ -10,9 +10,8 @@ Each training is a job of a queue. Finished jobs are reused, and stopped jobs re
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -33,6 +32,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.format.schema import HISTORIES
 from icrl4aht_data.utils.files import atomic_write, file_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.groups import grouped
 
 TEAMMATE_TRACK = "teammate"
 
@@ -73,6 +73,12 @@ _FIRST_EPISODES = 5
 _TRAINING: dict[str, Any] = {"learning_rate": 2e-3, "validate_every": 10**6, "save_every": 10**6, "log_every": 20}
 
 
+def proof_tasks() -> dict[str, tuple[Task, ...]]:
+    """Return the validation tasks that have headroom, of the tracks preference and teammate."""
+    played = [*bundled_tasks(TEAMMATE_TRACK, "validation"), *bundled_tasks(TEAMMATE_TRACK, "diverse")]
+    return {PREFERENCE: tuple(bundled_tasks(PREFERENCE, "validation")), TEAMMATE_TRACK: tuple(with_headroom(played))}
+
+
 @dataclass(frozen=True)
 class ProofOptions:
     """Settings that all training jobs of the proof share.
@@ -82,14 +88,14 @@ class ProofOptions:
         steps: number of training steps; with the defaults, a job takes about 35 minutes on a core.
         batch_size: number of windows or contexts in a batch.
         context: K, steps of a window or transitions of a context.
-        tasks: set of tasks -> its tasks; by default validation tasks, see `task_sets`.
+        tasks: name of a set -> its tasks; by default the validation tasks of two tracks that have headroom.
     """
 
     root: str | None = None
     steps: int = 4000
     batch_size: int = 16
     context: int = 500
-    tasks: dict[str, tuple[Task, ...]] | None = None
+    tasks: dict[str, tuple[Task, ...]] = field(default_factory=proof_tasks)
 
     @property
     def steps_per_update(self) -> int:
@@ -99,17 +105,6 @@ class ProofOptions:
     def training(self, seed: int) -> TrainOptions:
         """Return the settings of a training run, for the trainer."""
         return TrainOptions(self.steps, self.batch_size, self.context, seed=seed, **_TRAINING)
-
-    @property
-    def task_sets(self) -> dict[str, tuple[Task, ...]]:
-        """Name of a set -> its tasks; by default the validation tasks of two tracks that have headroom."""
-        if self.tasks is not None:
-            return self.tasks
-        played = [*bundled_tasks(TEAMMATE_TRACK, "validation"), *bundled_tasks(TEAMMATE_TRACK, "diverse")]
-        return {
-            PREFERENCE: tuple(bundled_tasks(PREFERENCE, "validation")),
-            TEAMMATE_TRACK: tuple(with_headroom(played)),
-        }
 
 
 @dataclass(frozen=True)
@@ -146,7 +141,7 @@ class ProofJob(TrainingJob):
     @property
     def settings(self) -> dict[str, Any]:
         """All settings that the result depends on, as JSON; the content of the release is not among them."""
-        tasks = {name: [task.task_id for task in own] for name, own in self.options.task_sets.items()}
+        tasks = {name: [task.task_id for task in own] for name, own in self.options.tasks.items()}
         return {"train": asdict(self.training), "root": self.options.root, "tasks": tasks, "first": self.first}
 
     def finished_text(self) -> str:
@@ -189,7 +184,7 @@ def play_sets(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool 
     """
     found = {}
     for control in (None, "cleared")[: 1 + controls]:
-        for name, tasks in options.task_sets.items():
+        for name, tasks in options.tasks.items():
             folder = out / f"{name}{' cleared' if control else ''}"
             shared: Any = {"seeds": _SEEDS[name], "control": control, "show": lambda *shown: None}
             run = evaluate_agent(agent, tasks, PROOF_PROTOCOL, folder, **shared)
@@ -206,36 +201,27 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
         references: name of an ego -> returns from `play_sets`.
         path: path of the file, which is replaced.
     """
-    entries: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
-    for job in jobs:
-        if job.is_finished():
-            entries[job.source, job.learner].append(job.result() | {"seed": job.seed})
     stay, expert = (references[name][TEAMMATE_TRACK]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
-    models = [
-        {
+    finished, models = [job for job in jobs if job.is_finished()], []
+    for (source, learner), own in grouped(finished, lambda job: (job.source, job.learner)).items():
+        results = [job.result() for job in own]
+        entry = {
             "histories": source,
             "learner": LEARNERS[learner].title,
-            "seeds": [one["seed"] for one in own],
-            "minutes": [one["minutes"] for one in own],
-            **{
-                key: [one["returns"][name][block] for one in own]
-                for key, name, block in (
-                    ("first", PREFERENCE, "1"),
-                    ("late", PREFERENCE, "6-20"),
-                    ("first_cleared", f"{PREFERENCE} cleared", "1"),
-                    ("late_cleared", f"{PREFERENCE} cleared", "6-20"),
-                )
-            },
-            "share": [round((one["returns"][TEAMMATE_TRACK]["all"] - stay) / (expert - stay), 3) for one in own],
+            "seeds": [job.seed for job in own],
+            "minutes": [one["minutes"] for one in results],
         }
-        for (source, learner), own in entries.items()
-    ]
+        for memory, control in (("", ""), ("_cleared", " cleared")):
+            for when, block in (("first", "1"), ("late", "6-20")):
+                entry[when + memory] = [one["returns"][PREFERENCE + control][block] for one in results]
+        earned = [one["returns"][TEAMMATE_TRACK]["all"] for one in results]
+        models.append(entry | {"share": [round((one - stay) / (expert - stay), 3) for one in earned]})
     options, dataset = jobs[0].options, load_icrl4aht(jobs[0].options.root)
     content = {
         "histories_sha256": file_hash(dataset.root / HISTORIES),
         "data_version": dataset.info.data_version,
         "training": {"steps": options.steps, "batch_size": options.batch_size, "context": options.context},
-        "tasks": {name: len(tasks) for name, tasks in options.task_sets.items()},
+        "tasks": {name: len(tasks) for name, tasks in options.tasks.items()},
         "references": {name: references[name][PREFERENCE] for name in COMPARED_EGOS[PREFERENCE]},
         "models": models,
     }

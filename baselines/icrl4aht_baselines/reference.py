@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -42,6 +41,7 @@ from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.templates import fill_template
 from icrl4aht_data.writing.combine import combine_releases
 
@@ -147,43 +147,6 @@ class ReferenceOutcome(NamedTuple):
     results: dict[str, Path]
 
 
-def make_reference(
-    name: str,
-    track: str,
-    out: Path,
-    show: Callable[..., None],
-    evaluates: bool = True,
-    teacher: str | None = None,
-) -> ReferenceOutcome:
-    """Make a reference model of a track with everything that it needs, or resume a stopped call.
-
-    Args:
-        name: a name in `RECIPES`.
-        track: name of the track.
-        out: output folder; its content is described at the top of this module.
-        show: function for progress, called with (description, units done, units, note).
-        evaluates: whether the model is also evaluated.
-        teacher: name or run folder of the agent that plays and labels the histories, such as `rl2-reference`; if None,
-            RL^2 is trained first. Existing releases and runs are reused, even if made with another teacher.
-
-    Raises:
-        OptionError: if a run folder holds a run with other settings. Existing releases are not checked.
-        TrainingStopped: after SIGTERM or SIGINT during training, whose state is saved.
-    """
-    steps, recipe = _ReferenceSteps(out, track, show, teacher), RECIPES[name]
-    run = out / f"{name}-{track}"
-    if not recipe.data:
-        run = steps.train_by_playing()
-    else:
-        histories, first = steps.teacher_histories(recipe.data), None
-        if recipe.own_round:
-            first = run.with_name(f"{run.name}-first")
-            steps.train(recipe, histories, first)
-            histories = steps.add_own_histories(histories, first, run)
-        steps.train(recipe, histories, run, before=first)
-    return ReferenceOutcome(name, track, run, steps.evaluate(name, run, recipe) if evaluates else {})
-
-
 def check_learns_from_teacher(name: str) -> None:
     """Check that a reference model learns from histories of a teacher, so that a teacher may be chosen.
 
@@ -196,13 +159,44 @@ def check_learns_from_teacher(name: str) -> None:
 
 
 @dataclass(frozen=True)
-class _ReferenceSteps:
-    """Steps that make the reference models of a track; a step is skipped if its output exists."""
+class ReferenceMaker:
+    """Maker of the reference models of a track. A step is skipped if its output exists.
 
-    out: Path
+    Attributes:
+        track: name of the track.
+        out: output folder; its content is described at the top of this module.
+        show: function for progress, called with (description, units done, units, note).
+        teacher: name or run folder of the agent that plays and labels the histories, such as `rl2-reference`; if None,
+            RL^2 is trained first. Existing releases and runs are reused, even if made with another teacher.
+    """
+
     track: str
+    out: Path
     show: Callable[..., None]
     teacher: str | None = None
+
+    def make(self, name: str, evaluates: bool = True) -> ReferenceOutcome:
+        """Make a reference model with everything that it needs, or resume a stopped call.
+
+        Args:
+            name: a name in `RECIPES`.
+            evaluates: whether the model is also evaluated.
+
+        Raises:
+            OptionError: if a run folder holds a run with other settings. Existing releases are not checked.
+            TrainingStopped: after SIGTERM or SIGINT during training, whose state is saved.
+        """
+        recipe, run = RECIPES[name], self.out / f"{name}-{self.track}"
+        if not recipe.data:
+            self.train_by_playing()
+        else:
+            histories, first = self.teacher_histories(recipe.data), None
+            if recipe.own_round:
+                first = run.with_name(f"{run.name}-first")
+                self.train(recipe, histories, first)
+                histories = self.add_own_histories(histories, first, run)
+            self.train(recipe, histories, run, before=first)
+        return ReferenceOutcome(name, self.track, run, self.evaluate(name, run, recipe) if evaluates else {})
 
     def noise_release(self) -> Path:
         """Generate the release of noise histories. Return the folder of the release."""
@@ -287,57 +281,34 @@ def write_bundled_card(
         name: name of the bundled model.
         outcomes: evaluated outcomes of the model's tracks.
         folder: folder of the bundled models.
-        teacher: agent that the histories were recorded of, see `make_reference`.
+        teacher: agent that the histories were recorded of, see `ReferenceMaker`.
     """
     (run,) = merge([read_run(found.results["test-seeded"]) for found in outcomes])
     validation = merge([read_run(found.results[kind]) for found in outcomes for kind in ("validation", "diverse")])
-    taught = f" --teacher {teacher}" if teacher else ""
-    command = f"icrl4aht-data research reference --name {outcomes[0].name}{taught} --bundle-as {name}"
-    drawn = [found.track for found in outcomes if (folder / name / found.track / RUN_CURVES).is_file()]
-    card = folder / name / MODEL_CARD
-    card.write_text(model_card(run, name, command, validation, drawn), encoding="utf-8")
-    return card
-
-
-def model_card(
-    run: EvaluationRun,
-    title: str,
-    command: str,
-    validation: Sequence[EvaluationRun] = (),
-    drawn: Sequence[str] = (),
-) -> str:
-    """Return the text of README.md for a bundled model.
-
-    Args:
-        run: results on test tasks of the models of all tracks; the card's table of models has a row for each.
-        title: name of the bundled model.
-        command: command that makes the model.
-        validation: results on validation tasks under the same protocol, which are also shown in tables.
-        drawn: tracks for which the folder has a figure of the training curves.
-    """
-    models: dict[str, list[ResultSource]] = defaultdict(list)
-    for source in run.sources:
-        if source.trained:
-            models[source.trained["run_hash"]].append(source)
+    trained = [source for source in run.sources if source.trained]
+    models = grouped(trained, lambda source: (source.trained or {})["run_hash"])  # the table has a row for each model
     configs: list[dict[str, Any]] = [(sources[0].trained or {})["config"] for sources in models.values()]
     config = configs[0]
     seeds = ", ".join(dict.fromkeys(str(config["train"]["seed"]) for config in configs))
-    overlaps = {name for one in (run, *validation) for name in one.overlaps(one.cells)}
+    overlaps = {overlap for one in (run, *validation) for overlap in one.overlaps(one.cells)}
     limits = [
         f"Each model is one run, of seed {seeds}: the variation between seeds is not known.",
         "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
         *overlap_legend(overlaps),
     ]
+    taught = f" --teacher {teacher}" if teacher else ""
+    command = f"icrl4aht-data research reference --name {outcomes[0].name}{taught} --bundle-as {name}"
     properties = [
         f"| method | {config['method']} |",
         f"| created with | icrl4aht-data {config['package_version']} |",
         f"| made by | `{command}` |",
     ]
     sections = [section for one in (run, *validation) for section in markdown_sections([one], one.protocol)]
+    drawn = [found.track for found in outcomes if (folder / name / found.track / RUN_CURVES).is_file()]
     shown = [f"Training of the model of track {track}:\n\n![curves]({track}/{RUN_CURVES})" for track in drawn]
-    return fill_template(
+    text = fill_template(
         "baseline.md",
-        title=title,
+        title=name,
         method=config["method"],
         training=" ".join(dict.fromkeys(map(training_sentence, configs))),
         properties="\n".join(properties),
@@ -347,6 +318,9 @@ def model_card(
         curves="\n\n".join(["## Curves", *shown, ""]) if shown else "",
         limits="\n".join(f"* {limit}" for limit in limits),
     )
+    card = folder / name / MODEL_CARD
+    card.write_text(text, encoding="utf-8")
+    return card
 
 
 def training_sentence(config: Mapping[str, Any]) -> str:

@@ -77,13 +77,11 @@ class Environment:
     Args:
         layout: one layout or several; or their tables, if a compiled function takes the tables as an argument.
         max_steps: steps of an episode: 400 in training, 100 in evaluation.
-        recipes: uint8 (R,), items of the recipes to draw from; by default the layout's recipes. Only for one layout.
         redraws: whether every episode starts on a layout that is drawn at random from all layouts.
     """
 
     layout: Layout | Sequence[Layout] | Tables
     max_steps: int = EPISODE_STEPS
-    recipes: np.ndarray | None = None
     redraws: bool = False
 
     @cached_property
@@ -93,9 +91,7 @@ class Environment:
             return self.layout
         if not isinstance(self.layout, Layout):
             return stack_tables(self.layout)
-        if self.recipes is None:
-            return self.layout.tables
-        return self.layout.tables._replace(recipes=self.recipes, recipe_count=np.uint32(len(self.recipes)))
+        return self.layout.tables
 
     @property
     def only_layout(self) -> Layout:
@@ -107,11 +103,6 @@ class Environment:
         if not isinstance(self.layout, Layout):
             raise TypeError("expected an environment of one layout, found several layouts or only tables")
         return self.layout
-
-    @property
-    def recipe_items(self) -> np.ndarray:
-        """Items of all recipes that the environment may draw, uint8 (R,)."""
-        return self.tables.recipes
 
     def init(self, keys: Key[Array, " N"], layout: Int[Array, " N"] | None = None) -> EnvState:
         """Return the start of the first episode of each environment.

@@ -216,7 +216,8 @@ class Scene:
         # As in the published code, the contents of all pots are added, as if all were in a single pot.
         return jnp.maximum(self.counts(self.state.recipe) - self.counts(self.state.pot_items).sum(axis=0), 0)
 
-    def counts(self, item: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
+    @staticmethod
+    def counts(item: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
         """Return an item's number of pieces of each ingredient of the layout, by ascending id; unused entries are 0."""
         # An item byte has two bits for each ingredient, above the bits of plate and cooked.
         shift = 2 + 2 * jnp.arange(3, dtype=jnp.uint8)

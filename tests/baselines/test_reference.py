@@ -13,7 +13,7 @@ from icrl4aht_baselines.agents import bundled
 from icrl4aht_baselines.agents.bundled import MODELS, bundled_models
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
-from icrl4aht_baselines.reference import RECIPES, RL2_HISTORIES, ReferenceOutcome
+from icrl4aht_baselines.reference import RECIPES, RL2_HISTORIES, ReferenceMaker, ReferenceOutcome
 from icrl4aht_baselines.report.results import EvaluationRun
 from icrl4aht_baselines.training import trainer
 from icrl4aht_baselines.training.histories import read_trained
@@ -66,10 +66,10 @@ def test_reference_command_rejects_unknown_names(tmp_path):
 def test_reference_model_is_bundled_with_all_tracks(tmp_path, monkeypatch):
     copied, cards = [], []
 
-    def fake_make_reference(name: str, track: str, *given: Any) -> ReferenceOutcome:
-        return ReferenceOutcome(name, track, tmp_path / track, {})
+    def fake_make(maker: ReferenceMaker, name: str, evaluates: bool) -> ReferenceOutcome:
+        return ReferenceOutcome(name, maker.track, tmp_path / maker.track, {})
 
-    monkeypatch.setattr(reference, "make_reference", fake_make_reference)
+    monkeypatch.setattr(ReferenceMaker, "make", fake_make)
     monkeypatch.setattr(bundled, "bundle_run", lambda run, name, track, **way: copied.append((name, track)))
     monkeypatch.setattr(reference, "write_bundled_card", lambda name, found, **way: cards.append(found))
     command = ["research", "reference", "--name", "rl2-reference", "--out", tmp_path, "--bundle-as", "rl2-reference"]
@@ -128,7 +128,8 @@ def tiny_recipes(monkeypatch, tmp_path) -> Path:
 
 @pytest.mark.slow
 def test_reference_model_trains_on_rl2_histories_then_on_its_own_histories(tiny_recipes):
-    found = reference.make_reference("ad-reference", "layout", tiny_recipes, lambda *shown: None, evaluates=False)
+    maker = ReferenceMaker("layout", tiny_recipes, lambda *shown: None)
+    found = maker.make("ad-reference", evaluates=False)
     assert found.run == tiny_recipes / "ad-reference-layout" and found.results == {}
     made = {path.name for path in tiny_recipes.iterdir() if path.is_dir() and not path.name.startswith(".")}
     own_round = {f"ad-reference-layout{end}" for end in ("", "-first", "-own", "-mixed")}
@@ -139,5 +140,5 @@ def test_reference_model_trains_on_rl2_histories_then_on_its_own_histories(tiny_
     own, mixed = (load_icrl4aht(tiny_recipes / f"ad-reference-layout-{name}") for name in ("own", "mixed"))
     assert len(mixed) == len(own) + len(load_icrl4aht(tiny_recipes / "agent-layout"))
     times = {path: path.stat().st_mtime_ns for path in tiny_recipes.rglob("*.safetensors")}
-    reference.make_reference("ad-reference", "layout", tiny_recipes, lambda *shown: None, evaluates=False)
+    maker.make("ad-reference", evaluates=False)
     assert {path: path.stat().st_mtime_ns for path in tiny_recipes.rglob("*.safetensors")} == times

@@ -126,7 +126,9 @@ def test_learning_benchmark_compares_ego_profiles(tmp_path):
 
 @pytest.mark.slow
 def test_learning_benchmark_measures_sequence_models(monkeypatch):
-    monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 8, 5, heads=2, context=6, encoder="mlp"))
+    monkeypatch.setitem(
+        SIZES, "tiny", ModelSize({"layers": 1, "width": 8, "heads": 2, "encoder": "mlp"}, {"steps": 5, "context": 6})
+    )
     tasks = [task for task in published_tasks("teammate") if task.layout.name == "demo_wide"][:1]
     monkeypatch.setattr(bench_learn, "published_tasks", lambda track: tasks)
     parts = "--part ad --part act --part tasks --encoder mlp --batch 2 --length 6 --steps 1"

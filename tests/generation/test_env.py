@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.padded import padded_layout
+from icrl4aht_generation.layouts.rearranged import with_four_recipes
 
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import INTERACT, STAY
@@ -20,7 +21,7 @@ from icrl4aht_data.overcooked.state import State, columns, record_size, unpack
 from tests.helpers.states import random_records, state_record
 
 CRAMPED = LAYOUTS["cramped_up"]
-PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are one piece of ingredient 0 and 1
+PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO is one piece of ingredient 0, ONE of 1
 FOUR_RECIPES = np.array([3 * ZERO, 2 * ZERO + ONE, ZERO + 2 * ONE, 3 * ONE], np.uint8)
 
 N, MAX_STEPS, STEPS = 2000, 5, 13  # N environments in one batch
@@ -188,11 +189,11 @@ def test_results_of_an_environment_do_not_depend_on_its_batch(cramped, keys, act
         assert (ours.state.key == theirs.state.key[which]).all()
 
 
-def test_raw_random_keys_give_results_of_typed_keys(cramped, keys):
+def test_raw_random_keys_give_the_results_of_typed_keys(cramped, keys):
     np.testing.assert_array_equal(cramped.init(jax.random.key_data(keys)).record, cramped.init(keys).record)
 
 
-def transitions(compiled: Compiled, seed: int, deliveries: int) -> np.ndarray:
+def recipe_transitions(compiled: Compiled, seed: int, deliveries: int) -> np.ndarray:
     """Deliver in every step; return recipes before and after each correct delivery, shape (deliveries * N, 2)."""
     state, pairs = compiled.init(some_keys(seed)), []
     for _ in range(deliveries):
@@ -207,7 +208,7 @@ def transitions(compiled: Compiled, seed: int, deliveries: int) -> np.ndarray:
 
 
 def test_correct_delivery_draws_a_uniform_next_recipe(cramped):
-    pairs = transitions(cramped, seed=3, deliveries=4)
+    pairs = recipe_transitions(cramped, seed=3, deliveries=4)
     assert set(np.unique(pairs)) == {3 * ZERO, 3 * ONE}
     assert_uniform(pairs, 4)  # the next recipe may equal the previous one
     by_environment = pairs[:, 1].reshape(4, N).T
@@ -223,14 +224,13 @@ def test_recipe_changes_only_after_correct_deliveries(batch_steps):
         assert 0.4 < changed < 0.6 if correct else changed == 0
 
 
-def test_custom_recipes_are_drawn_at_starts_and_after_deliveries():
-    four = Compiled.jit(Environment(CRAMPED, max_steps=MAX_STEPS, recipes=FOUR_RECIPES))
-    np.testing.assert_array_equal(four.env.recipe_items, FOUR_RECIPES)
-    np.testing.assert_array_equal(Environment(CRAMPED).recipe_items, [3 * ZERO, 3 * ONE])
+def test_other_recipes_are_drawn_at_starts_and_after_deliveries():
+    four = Compiled.jit(Environment(with_four_recipes(CRAMPED), max_steps=MAX_STEPS))
+    np.testing.assert_array_equal(four.env.tables.recipes, FOUR_RECIPES)
     started = fields(CRAMPED, four.init(some_keys(4)).record).recipe
     assert set(np.unique(started)) == set(FOUR_RECIPES.tolist())
     assert_uniform(started, 4)
-    pairs = transitions(four, seed=4, deliveries=MAX_STEPS)  # the last delivery ends the episode
+    pairs = recipe_transitions(four, seed=4, deliveries=MAX_STEPS)  # the last delivery ends the episode
     assert set(np.unique(pairs)) == set(FOUR_RECIPES.tolist())
     assert_uniform(pairs, 16)
 
@@ -247,7 +247,7 @@ def random_inputs(layout: Layout, size: int) -> tuple[np.ndarray, np.ndarray, np
 
 @pytest.fixture(scope="module")
 def jitted_rules() -> jax.stages.Wrapped:
-    """Return a function that steps the rules and observes the state before the step; all layouts share it."""
+    """Return one compiled function for all layouts that steps the rules and observes the state before the step."""
     return jax.jit(lambda tables, *inputs: (*rules.step(tables, *inputs), observe_both(tables, inputs[0])))
 
 

@@ -24,13 +24,13 @@ ENVS, STEPS = 3 * len(NAMES), 30
 
 
 @pytest.fixture(scope="module")
-def played() -> dict[str, np.ndarray]:
+def recorded_steps() -> dict[str, np.ndarray]:
     """Play two episodes of random actions; return arrays (steps, environments, ...) by name."""
     env = Environment(GROUP, max_steps=STEPS)
 
     def step(state, key):
         actions = jax.random.randint(key, (ENVS, 2), 0, 6)
-        actions = jnp.where(jax.random.uniform(key, actions.shape) < 0.4, 5, actions)  # mostly `interact`
+        actions = jnp.where(jax.random.uniform(key, actions.shape) < 0.4, 5, actions)  # about half are `interact`
         after = env.step(state, actions)
         shown = {
             "record": state.record,
@@ -54,10 +54,10 @@ def keys_of(count: int) -> jax.Array:
 
 
 @pytest.mark.parametrize("number", range(len(NAMES)), ids=NAMES)
-def test_layout_in_a_group_plays_like_a_single_layout(played, number):
+def test_layout_in_a_group_plays_like_a_single_layout(recorded_steps, number):
     layout, envs = GROUP[number], np.arange(number, ENVS, len(NAMES))
     own = padded_positions(layout, stack_tables(GROUP))
-    part = {name: value[:, envs] for name, value in played.items()}
+    part = {name: value[:, envs] for name, value in recorded_steps.items()}
     assert (part["layout"] == number).all()
     records, final = part["record"][..., own], part["final"][..., own]
     others = np.setdiff1d(np.arange(part["record"].shape[-1]), own)

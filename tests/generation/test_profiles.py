@@ -52,7 +52,8 @@ def changed(tmp_path) -> Callable[[str, str], str]:
     return write
 
 
-@pytest.mark.parametrize("name", sorted({*profile_names()} - {"teach"}))  # profile billion has the tasks of teach
+# Profile teach is left out, since its tasks are also tasks of profile billion.
+@pytest.mark.parametrize("name", sorted({*profile_names()} - {"teach"}))
 def test_shipped_profiles_list_valid_tasks(name):
     profile = load_profile(name)
     assert profile.name == name
@@ -171,7 +172,7 @@ def test_sampled_teammates_are_used_by_ppo_and_noise_tasks(changed):
 def small_lists(monkeypatch) -> None:
     """Replace the shipped lists of spread teammates by four training and one validation teammate on two layouts."""
 
-    def spread(layout: str) -> LayoutSpread:
+    def layout_spread(layout: str) -> LayoutSpread:
         chosen = tuple(
             SpreadTeammate(split, "utility_greedy", k, {"w": k / 2}, "H4/t0", 0.5, "H1/t2", 0.4, 0.25, 0.0, 1.0, 30.0)
             for k, split in enumerate(["train"] * 4 + ["validation"])
@@ -179,7 +180,7 @@ def small_lists(monkeypatch) -> None:
         return LayoutSpread(layout, 9, 6, 5, chosen)
 
     monkeypatch.setattr(
-        spread_module, "_bundled_spreads", lambda: {k: spread(k) for k in ("coord_simple", "cramped_up")}
+        spread_module, "_bundled_spreads", lambda: {k: layout_spread(k) for k in ("coord_simple", "cramped_up")}
     )
 
 
@@ -229,7 +230,7 @@ def test_profile_with_too_many_spread_teammates_raises_error(changed, small_list
         spread_profile(changed, "", "per_layout = 5")
 
 
-def test_validation_teammate_that_also_trains_raises_error(changed, monkeypatch):
+def test_validation_teammate_that_is_also_a_training_teammate_raises_error(changed, monkeypatch):
     entry = heuristic_teammate("utility_greedy", "high_inertia", 3)
     monkeypatch.setattr(profile_module, "spread_teammates", lambda layout, split, count: [entry] * count)
     counts = "per_layout = 0\nvalidation = { coord_simple = 1 }"
@@ -248,7 +249,7 @@ def test_preset_teammates_are_used_by_ppo_and_noise_tasks(changed):
 
 
 def test_given_tasks_keep_their_recorded_sources(changed):
-    """The tasks of a release have the sources that the release's provenance states."""
+    """The tasks of a release keep the sources that the release's provenance records."""
     profile = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\nlearners = 2\npresets ='))
     tasks = [work.task for work in profile.units() if work.learner == 0][:3]
     first, second, third = (task.task_id for task in tasks)

@@ -100,8 +100,8 @@ def max_validation_tasks_per_layout() -> int:
 
 
 def tiny_model_size() -> tuple[int, int, int]:
-    assert (TINY_SIZE.encoder, TINY_SIZE.positions) == ("mlp", "rope")
-    return TINY_SIZE.layers, TINY_SIZE.width, TINY_SIZE.context
+    assert (TINY_SIZE.model["encoder"], TINY_SIZE.model["positions"]) == ("mlp", "rope")
+    return TINY_SIZE.model["layers"], TINY_SIZE.model["width"], TINY_SIZE.train["context"]
 
 
 def count_test_behaviours() -> tuple[int, ...]:
@@ -127,13 +127,12 @@ def bundled_release_size() -> tuple[int, ...]:
 CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("README", "return of {} of the {} bundled histories rises by at least {} from", count_rising_entries),
     ("README", "{} histories of {} tasks on {} layouts: {} steps in {} MB", bundled_release_size),
-    ("README", "a delivery is worth {}.", lambda: DELIVERY_REWARD),
+    ("README", "correct delivery is worth {}.", lambda: DELIVERY_REWARD),
     ("README", "more than `stay` in {} of the {} cells", count_cells_without_headroom),
     ("docs/index", "benchmark's {} test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/evaluating", "There are {} published test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/evaluating", "of {} episodes with {} steps each", lambda: (SEEDED.episodes, SEEDED.steps)),
     ("docs/evaluating", "canonical channels, the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
-    ("docs/evaluating", "more than `stay` in {} of the {} cells", count_cells_without_headroom),
     ("docs/protocol", "choices.md): up to {} [drawn", max_validation_tasks_per_layout),
     ("docs/protocol", "scripts of {} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),
     ("docs/protocol", "{} of its modes do not cooperate", lambda: TERRITORY.choices["behavior_mode"] - 1),
@@ -170,7 +169,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/publishing", "of every step ({} to {} bytes)", lambda: range_over_layouts(record_size)),
     ("docs/loading", "Layouts have {} to {} channels", lambda: range_over_layouts(lambda one: one.channels)),
     ("docs/training", "`--size tiny`: {} layers of width {}, one dense layer as the encoder, K = {}", tiny_model_size),
-    ("docs/training", "its {} steps take two cores", lambda: TINY_SIZE.steps),
+    ("docs/training", "its {} steps take two cores", lambda: TINY_SIZE.train["steps"]),
     ("docs/training", "A checkpoint is written every {} minutes", lambda: SAVE_MINUTES),
     ("docs/training", "A {} of the histories are held out", lambda: HistoryOptions(("demo_wide",)).held_out),
     ("docs/format", "{}, the version of this format, or {}", lambda: READABLE_VERSIONS[::-1]),

@@ -150,7 +150,7 @@ def reference_command(
     with its choices. ad-rising imitates histories of rl2-reference that begin with random actions.
     """
     from icrl4aht_baselines.agents.bundled import bundle_run, check_bundle_name
-    from icrl4aht_baselines.reference import RECIPES, check_learns_from_teacher, make_reference, write_bundled_card
+    from icrl4aht_baselines.reference import RECIPES, ReferenceMaker, check_learns_from_teacher, write_bundled_card
 
     if bundle:
         try:
@@ -168,7 +168,7 @@ def reference_command(
     outcomes = []
     with progress_bars() as show:
         for name, of_track in product(names, track):
-            outcomes.append(make_reference(name, of_track, out, show, evaluates, teacher))
+            outcomes.append(ReferenceMaker(of_track, out, show, teacher).make(name, evaluates))
     for found in outcomes:
         click.echo(f"{found.name}, {found.track}: {found.run}")
         for kind, folder in found.results.items():

@@ -219,7 +219,7 @@ def prepare_training(
         played, episodes = job.about["histories"], counted_noun(job.trainer.play.episodes, "episode")
         text = (
             f"{method}: layers {sized.recurrent_layers}, width {sized.width}, encoder {sized.encoder}, steps "
-            f"{options.steps}, in each {job.trainer.tasks} tasks of {episodes}\nplaying on "
+            f"{options.steps}, in each {len(job.trainer.tasks)} tasks of {episodes}\nplaying on "
             f"{', '.join(played['layouts'])}, canonical channels, with the teammates of {len(played['groups'])} "
             f"families and layouts"
         )

@@ -5,7 +5,6 @@ Shapes: `B` batch size, `L` length of a window, `D` width, `N` entries of an obs
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -151,11 +150,13 @@ def auxiliary_losses(output: StepOutput, steps: StepInput, batch: ADBatch, world
     return {"next_obs_loss": mean_of_rows(errors, valid)}
 
 
-def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
-    """Return AD's loss function: cross-entropy of the target actions over valid positions (paper, App. E.2).
+def action_method(name: str, label: str, options: ModelOptions, world: World, trunk: nn.Module) -> Method:
+    """Return Algorithm Distillation with the given trunk.
 
-    The target actions are the actions of the history, or its labels.
+    The loss is the cross-entropy of the target actions over valid positions (paper, App. E.2). The target actions are
+    the actions of the history, or its labels.
     """
+    model = make_step_model(options, world, trunk, nn.Dense(world.actions))
 
     def loss(params: Any, slow: Any, batch: ADBatch, key: Any) -> tuple[Array, dict[str, Array]]:
         steps, mask = batch_steps(batch, world.view), jnp.asarray(batch.attention_mask)
@@ -172,21 +173,9 @@ def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
         total = sum(auxiliary.values(), start=log["action_loss"])
         return total, {"loss": total, **log, **encoding_log(steps.obs)}
 
-    return loss
+    return step_method(name, label, model, loss, world, logits=lambda head: head)
 
 
-def action_method(
-    name: str, label: str, make_trunk: Callable[[ModelOptions], nn.Module]
-) -> Callable[[ModelOptions, World], Method]:
-    """Return a function from (ModelOptions, World) to Algorithm Distillation with the given kind of trunk."""
-
-    def make(options: ModelOptions, world: World) -> Method:
-        model = make_step_model(options, world, make_trunk(options), nn.Dense(world.actions))
-        loss = action_loss(model, options, world)
-        return step_method(name, label, model, loss, world, logits=lambda head: head)
-
-    return make
-
-
-ad = action_method("ad", "AD", make_transformer)
-"""Function that makes AD; the model has 3,283,870 parameters for C = 40 channels."""
+def ad(options: ModelOptions, world: World) -> Method:
+    """Return the method AD; its model has 3,283,870 parameters for C = 40 channels."""
+    return action_method("ad", "AD", options, world, make_transformer(options))

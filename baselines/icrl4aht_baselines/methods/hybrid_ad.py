@@ -11,6 +11,8 @@ from icrl4aht_generation.learners.network import GRU
 from jaxtyping import Array, Float
 
 from icrl4aht_baselines.methods.ad import action_method
+from icrl4aht_baselines.methods.method import Method, World
+from icrl4aht_baselines.methods.options import ModelOptions
 
 
 class RecurrentTrunk(nn.Module):
@@ -59,7 +61,7 @@ class RecurrentTrunk(nn.Module):
         return self.norm(x), jnp.concatenate(last_states, axis=-1)
 
 
-hybrid_ad = action_method(
-    "hybrid_ad", "Hybrid-AD", lambda options: RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
-)
-"""Function that makes Hybrid-AD; the model has 913,310 parameters for C = 40 channels."""
+def hybrid_ad(options: ModelOptions, world: World) -> Method:
+    """Return the method Hybrid-AD; its model has 913,310 parameters for C = 40 channels."""
+    trunk = RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
+    return action_method("hybrid_ad", "Hybrid-AD", options, world, trunk)

@@ -16,40 +16,26 @@ Positions = Literal["none", "rope"]
 
 
 class ModelSize(NamedTuple):
-    """Values of `ModelOptions` and `TrainOptions` for a named model size.
+    """Values of options for a named model size; options that it does not state have their defaults.
 
     Attributes:
-        steps: number of training steps.
-        context: K, steps of a window or transitions of a context.
+        model: values of `ModelOptions`.
+        train: `steps` and `context` of `TrainOptions`.
         cpu_batch: default batch size on a CPU.
-        layers, width, heads, positions, encoder: see `ModelOptions`.
     """
 
-    layers: int
-    width: int
-    steps: int
-    heads: int = 4
-    context: int = 500
-    positions: Positions = "none"
-    encoder: EncoderKind = "paper"
+    model: dict[str, Any]
+    train: dict[str, Any]
     cpu_batch: int = 8
 
-    @property
-    def model(self) -> dict[str, Any]:
-        """Values of `ModelOptions` for this size."""
-        return {name: getattr(self, name) for name in ("layers", "width", "heads", "positions", "encoder")}
 
-    @property
-    def train(self) -> dict[str, Any]:
-        """Values of `TrainOptions` for this size, without the batch size, which depends on the device."""
-        return {"steps": self.steps, "context": self.context}
-
+_TINY = {"layers": 2, "width": 64, "heads": 2, "positions": "rope", "encoder": "mlp"}
 
 SIZES = {
-    "tiny": ModelSize(2, 64, 20_000, heads=2, context=200, positions="rope", encoder="mlp", cpu_batch=16),
-    "small": ModelSize(4, 256, 20_000),
-    "medium": ModelSize(8, 512, 50_000),
-    "large": ModelSize(12, 768, 100_000),
+    "tiny": ModelSize(_TINY, {"steps": 20_000, "context": 200}, cpu_batch=16),
+    "small": ModelSize({"layers": 4, "width": 256}, {"steps": 20_000, "context": 500}),
+    "medium": ModelSize({"layers": 8, "width": 512}, {"steps": 50_000, "context": 500}),
+    "large": ModelSize({"layers": 12, "width": 768}, {"steps": 100_000, "context": 500}),
 }
 """Model sizes by name: `tiny` for two CPU cores, and the paper's (Sec. 5.3, "Model Scale and Training Budget")."""
 

@@ -52,13 +52,9 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
 
     def make_checked(options: ModelOptions, world: World) -> Method:
         method = make(options, world)
-        if not isinstance(method, Method):
-            raise METHOD_PLUGINS.error(name, f"expected a function that returns a Method, found result {method!r:.100}")
-        if method.name != name or method.data not in ("ad", "dpt"):
-            raise METHOD_PLUGINS.error(
-                name,
-                f"expected name {name!r} and data 'ad' or 'dpt', found name {method.name!r} and data {method.data!r}",
-            )
+        if not isinstance(method, Method) or method.name != name or method.data not in ("ad", "dpt"):
+            expected = f"expected a function that returns a Method with name {name!r} and data 'ad' or 'dpt'"
+            raise METHOD_PLUGINS.error(name, f"{expected}, found {method!r:.100}")
         return method
 
     return make_checked

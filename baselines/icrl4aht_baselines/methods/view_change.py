@@ -80,9 +80,9 @@ def _exchange_directions(obs: Array, one: str, other: str) -> Array:
     return jnp.concatenate([obs[..., run[0] : run[-1] + 1] for run in runs], axis=-1)
 
 
-def no_change(*shape: int) -> ViewChange:
-    """Return a `ViewChange` of shape (*B,) that leaves observations and actions unchanged."""
-    no: Any = jnp.zeros(shape, bool)
+def no_change() -> ViewChange:
+    """Return a `ViewChange` without axes that leaves observations and actions unchanged."""
+    no: Any = jnp.bool_(False)
     return ViewChange(no, no, no)
 
 

@@ -8,11 +8,10 @@ memory across episodes can earn. It is an estimate, because longer training woul
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
@@ -20,15 +19,15 @@ from icrl4aht_generation.teammates.registry import build_teammate, with_equal_pa
 from scipy import stats
 
 from icrl4aht_baselines.online.responses import EgoJob
-from icrl4aht_baselines.online.rl2 import TaskGroup
+from icrl4aht_baselines.online.rl2 import PlayTask
 from icrl4aht_baselines.training.options import ResponseOptions
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.templates import markdown_table
 
-EgoKind = Literal["informed", "episodic"]
-EGO_KINDS: tuple[EgoKind, ...] = ("informed", "episodic")
+EGO_KINDS = ("informed", "episodic")
 
 MEASURED_EPISODES = 100
 """Number of episodes of each task over which the mean return of a trained ego is measured."""
@@ -49,7 +48,7 @@ class HeadroomJob(EgoJob):
     """
 
     title: str
-    kind: EgoKind
+    kind: str
 
     def __post_init__(self) -> None:
         if len(self.tasks) > self.options.tasks:
@@ -76,28 +75,22 @@ class HeadroomJob(EgoJob):
 
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
         """Train the ego. Return the `returns`: task id -> mean return with sampled actions in new episodes."""
-        trainer, params = self.train(self._task_groups(), on_update)
-        by_task: dict[str, list[float]] = defaultdict(list)
-        for group, returns in trainer.measure(params, MEASURED_EPISODES, _MEASURE_SEED).items():
-            for task_id, own in zip(group.ids, returns.mean(axis=1), strict=True):
-                by_task[task_id].append(float(own))
-        return {"returns": {one.task_id: round(float(np.mean(by_task[one.task_id])), 3) for one in self.tasks}}
+        trainer, params = self.train(self._play_tasks(), on_update)
+        returns = trainer.measure(params, MEASURED_EPISODES, _MEASURE_SEED).mean(axis=1)
+        ids = np.array([task.id for task in trainer.tasks])
+        return {"returns": {one.task_id: round(float(returns[ids == one.task_id].mean()), 3) for one in self.tasks}}
 
-    def _task_groups(self) -> list[TaskGroup]:
-        """Return the groups of tasks that are played in parallel, one for each kind of teammate."""
-        numbers: dict[str, list[int]] = defaultdict(list)
-        for played in range(self.options.tasks):
-            number = played % len(self.tasks)
-            numbers[self.tasks[number].teammate_kind].append(number)
-        groups = []
-        for kind, own in numbers.items():
-            layouts = [self.tasks[number].layout for number in own]
-            several = len(set(layouts)) > 1
-            entries = with_equal_parameters([self.tasks[number].teammate for number in own])
-            mates = [build_teammate(None if several else layouts[0], entry) for entry in entries]
-            told, ids = own if self.kind == "informed" else None, [self.tasks[number].task_id for number in own]
-            groups.append(TaskGroup(layouts, kind, mates, False, self.title, told, ids))
-        return groups
+    def _play_tasks(self) -> list[PlayTask]:
+        """Return the tasks that are played in parallel, in which each of `tasks` appears about equally often."""
+        of_kind = grouped(self.tasks, lambda task: task.teammate_kind)
+        several = {kind for kind, own in of_kind.items() if len({task.layout for task in own}) > 1}
+        different, entries = [], with_equal_parameters([task.teammate for task in self.tasks])
+        for number, (task, entry) in enumerate(zip(self.tasks, entries, strict=True)):
+            kind, partner = task.teammate_kind, number if self.kind == "informed" else None
+            # Heuristics for several layouts are built without a layout, so that one program plays on all of them.
+            mate = build_teammate(None if kind in several else task.layout, entry)
+            different.append(PlayTask(task.layout, kind, mate, False, self.title, partner, task.task_id))
+        return [different[played % len(different)] for played in range(self.options.tasks)]
 
 
 def headroom_jobs(

@@ -39,16 +39,17 @@ from icrl4aht_baselines.evaluate.rollout import Programs
 from icrl4aht_baselines.online.teammates import tasks_on_layouts
 from icrl4aht_baselines.training.run_folder import check_same_settings
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks, teammate_id
+from icrl4aht_data.benchmark.tasks import Task, make_task, teammate_id
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.fetch import Remote
 from icrl4aht_data.format.checkpoints import checkpoint_files
 from icrl4aht_data.format.provenance import ExpertLabels, LabelView, Provenance, ReferenceEgos, TeammateSwaps
-from icrl4aht_data.format.schema import TASKS, TEAMMATES, curve_ends, episode_ends
+from icrl4aht_data.format.schema import TEAMMATES, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import check_target
@@ -249,17 +250,12 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
         tasks: tasks with additional heuristic teammates; tasks on layouts without selected histories are left out.
 
     Raises:
-        OptionError: if the release does not describe a teammate of the histories, or one of `tasks` has a learned
-            teammate.
+        NotStoredError: if the release was made without its tasks.
+        OptionError: if one of `tasks` has a learned teammate.
     """
-    wanted = set(dataset.column("task_id").tolist())
-    known = [task for task in read_tasks(dataset.root / TASKS) if task.task_id in wanted]
-    missing = wanted - {task.task_id for task in known}
-    if missing:
-        raise OptionError(
-            f"{dataset.root}: {TASKS} does not describe {len(missing)} of {len(wanted)} tasks, such as "
-            f"{min(missing)}: choose a release that was made with its tasks"
-        )
+    history_of = dict(zip(dataset.column("task_id").tolist(), dataset.ids.tolist(), strict=True))
+    wanted = {dataset.history_task(history_id).task_id for history_id in history_of.values()}
+    known = [task for task in dataset.tasks.values() if task.task_id in wanted]
     found: dict[tuple[str, str], Task] = {}
     references = {}
     for task in known + tasks_on_layouts(tasks, dataset.layouts):
@@ -330,14 +326,11 @@ def collect_release(
     parts.mkdir(parents=True, exist_ok=True)
     with atomic_write(begun) as partial:
         write_json(partial, settings)
-    groups: dict[tuple[str, str], list[Task]] = defaultdict(list)
-    for task in teammates.tasks:
-        groups[task.layout.name, task.teammate_kind].append(task)
     total = len(teammates.tasks) * config.histories * config.episodes
     show, label = counted(progress, f"{agent.name}: episodes", total), labeller and labeller.make
     by = f"{agent.name}, before the noise" if labeller is None else f"{labeller.name}, in histories of {agent.name}"
     new = []
-    for (layout, kind), tasks in groups.items():
+    for (layout, kind), tasks in grouped(teammates.tasks, lambda task: (task.layout.name, task.teammate_kind)).items():
         folder = parts / f"{layout}-{kind}"
         if folder.is_dir():
             show(len(tasks) * config.histories * config.episodes)

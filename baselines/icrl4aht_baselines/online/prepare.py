@@ -15,7 +15,7 @@ from icrl4aht_generation.teammates.spread import find_measured
 
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
-from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup, make_group, make_groups
+from icrl4aht_baselines.online.rl2 import PlayTask, PlayTrainer, make_group, make_groups
 from icrl4aht_baselines.online.teammates import tasks_on_layouts
 from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cell, training_cells
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
@@ -28,6 +28,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import Labels
+from icrl4aht_data.utils.groups import grouped
 
 FLAT_SHARE = 0.3
 """Number of tasks on a layout on which the oracle earns no more than `stay`, relative to other layouts."""
@@ -62,6 +63,7 @@ def prepare_play(
         tasks: tasks with additional heuristic teammates; tasks on other layouts are left out.
 
     Raises:
+        UnknownNameError: if a filter has an unknown value.
         EmptySelectionError: if no history passes a filter.
         OptionError: if `histories` has options that do not apply to playing, none of `tasks` is on the chosen layouts,
             or one of `tasks` has a learned teammate.
@@ -76,7 +78,8 @@ def prepare_play(
     hidden = [get_layout(one).name for one in histories.hide_recipe]
     groups = _task_groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
     # With few tasks, some teammates are in no group, so the record of training data must not state them.
-    played = {task for group in groups for task in group.ids}
+    searched = {layout for layout, _ in teammates if _wants_hidden_dish(layout)}
+    played = [task._replace(searched=task.layout in searched) for group in groups for task in group]
     labels: Labels | None = "oracle" if play.imitation else None
     about = {
         "model": asdict(model),
@@ -88,12 +91,12 @@ def prepare_play(
             "hide_recipe": hidden,
             "channels": "canonical",
             "obs_shape": list(observation_shape(layouts[0], True)),
-            "groups": {group.name: len(group.teammates) for group in groups},
-            "searched": sorted({group.label for group in groups if group.searched}),
+            "groups": {group[0].name: len(group) for group in groups},
+            "searched": sorted({layout.name for layout in searched}),
         },
-        "trained_on": _training_record(dataset, tasks, played, labels),
+        "trained_on": _training_record(dataset, tasks, {task.id for task in played}, labels),
     }
-    trainer = PlayTrainer(method, options, play, groups, histories.mirror)
+    trainer = PlayTrainer(method, options, play, played, histories.mirror)
     return TrainingTask(method, TrainingData(None, {}), options, about, trainer)
 
 
@@ -159,7 +162,7 @@ def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
 
 def _task_groups(
     teammates: _Teammates, shares: Mapping[str, float], hidden: Sequence[str], play: PlayOptions, tasks: int
-) -> list[TaskGroup]:
+) -> list[list[PlayTask]]:
     """Return the groups of training tasks, including other versions of the layouts if `play` requests them.
 
     Args:
@@ -185,8 +188,7 @@ def _task_groups(
     total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
     rearranged = {layout: REARRANGED_SHARE * shares[layout.name] for layout in heuristics if play.rearranged}
     fixed = round(tasks * total / (total + sum(rearranged.values())))
-    searched = [layout for layout, _ in teammates if _wants_hidden_dish(layout)]
-    groups = make_groups(everywhere, fixed, shares, hidden, searched)
+    groups = make_groups(everywhere, fixed, shares, hidden)
     for layout, share in rearranged.items():
         count = round((tasks - fixed) * share / sum(rearranged.values()))
         groups += _rearranged_groups(layout, heuristics[layout], count, play.rearranged, layout.name in hidden)
@@ -226,7 +228,7 @@ def _heuristic_teammates(teammates: _Teammates) -> dict[Layout, dict[str, dict[s
 
 def _rearranged_groups(
     layout: Layout, kinds: Mapping[str, dict[str, Policy]], tasks: int, versions: int, hidden: bool
-) -> Iterator[TaskGroup]:
+) -> Iterator[list[PlayTask]]:
     """Yield one group of tasks for each kind of teammate, on rearranged versions of a layout.
 
     The versions are divided equally among the kinds of teammates, and the tasks of a kind equally among its versions.
@@ -271,11 +273,11 @@ def _training_record(
     if dataset is not None:
         of_played = np.isin(dataset.column("task_id"), sorted(played))
         found = training_cells(dataset.select(of_played), labels) if of_played.any() else []
-    cells: dict[tuple[str, str, str, str], list[Task]] = defaultdict(list)
-    for task in tasks:
-        if task.task_id in played:
-            cells[task.layout.name, task.split, task.teammate_family, task.teammate_kind].append(task)
-    for cell, own in cells.items():
+    of_cell = grouped(
+        (task for task in tasks if task.task_id in played),
+        lambda task: (task.layout.name, task.split, task.teammate_family, task.teammate_kind),
+    )
+    for cell, own in of_cell.items():
         ids, mates = [task.task_id for task in own], sorted({teammate_id(task.teammate) for task in own})
         found.append(training_cell((*cell, TASKS_SOURCE), labels, ids, 0, mates))
     return found

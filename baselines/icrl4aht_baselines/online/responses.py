@@ -7,7 +7,6 @@ a lower bound, because longer training or another learner may earn more. For com
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -29,7 +28,7 @@ from icrl4aht_baselines.agents.egos import PlayMode, trained_policy, with_view
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
-from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup
+from icrl4aht_baselines.online.rl2 import PlayTask, PlayTrainer
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.job import TrainingJob
 from icrl4aht_baselines.training.options import PlayOptions, ResponseOptions
@@ -47,6 +46,7 @@ from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroo
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.utils.files import json_hash, parse_json, read_text
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.templates import markdown_table
 
 PROTOCOL = "seeded"
@@ -59,9 +59,10 @@ RESPONSES_FILE = "best_responses.json"
 """Name of the file of best responses, in a folder of training runs and among the package's cards."""
 
 ABOUT = (
-    "Best responses: recurrent PPO with the benchmark's 5 x 5 view, trained with one teammate alone, memory cleared "
-    "before each episode; the oracle is imitated in the first half. The best training is chosen on episodes of seed "
-    f"{CHOICE_SEEDS[0]}; returns are means over the tasks and the seeds {', '.join(map(str, REPORT_SEEDS))}."
+    "Best responses are recurrent PPO agents with the benchmark's 5 x 5 view. Each is trained with one teammate, with "
+    "memory cleared before each episode, and imitates the oracle in the first half of the training. Episodes of seed "
+    f"{CHOICE_SEEDS[0]} decide which training run is used. Returns are means over the tasks and the seeds "
+    f"{', '.join(map(str, REPORT_SEEDS))}."
 )
 
 
@@ -75,20 +76,20 @@ def find_behaviours(tasks: Iterable[Task]) -> list[tuple[Task, ...]]:
     The tasks of a group share one best response. Teammates behave the same if their distance on the states of
     `teammates.distances` is below `SAME_BEHAVIOUR`. On layouts without test tasks, teammates are not compared.
     """
-    groups: dict[Any, list[Task]] = defaultdict(list)
-    for task in tasks:
+
+    def group(task: Task) -> tuple[Any, ...]:
         alone = task.task_id if task.layout.name not in LAYOUT_NAMES else ""
-        groups[task.split, task.layout.name, task.recipes, task.teammate_kind, alone].append(task)
+        return task.split, task.layout.name, task.recipes, task.teammate_kind, alone
+
     found = []
-    for own in groups.values():
+    for own in grouped(tasks, group).values():
         if len(own) == 1:
             found.append((own[0],))
             continue
         plain = replace(own[0], recipes=None).layout
         actions = act_on_records(plain, [build_teammate(plain, task.teammate) for task in own], common_states(plain)[0])
-        numbers = np.array(group_behaviours(actions))
-        for number in dict.fromkeys(numbers.tolist()):
-            found.append(tuple(own[k] for k in np.flatnonzero(numbers == number)))
+        alike = grouped(zip(group_behaviours(actions), own, strict=True), lambda numbered: numbered[0])
+        found += [tuple(task for _, task in one) for one in alike.values()]
     return found
 
 
@@ -147,19 +148,19 @@ class EgoJob(TrainingJob):
             "code_version": version("icrl4aht-data"),
         }
 
-    def train(self, groups: Sequence[TaskGroup], on_update: OnUpdate, params: Any = None) -> tuple[PlayTrainer, Any]:
-        """Train an ego on groups of tasks, or resume a stopped run. Return the trainer and the parameters.
+    def train(self, played: Sequence[PlayTask], on_update: OnUpdate, params: Any = None) -> tuple[PlayTrainer, Any]:
+        """Train an ego on tasks, or resume a stopped run. Return the trainer and the parameters.
 
         Args:
-            groups: groups of tasks; with `partners`, the ego observes the task's number in every step.
+            played: tasks to play in every step; with `partner`, the ego observes the teammate's number.
             on_update: function for progress, see `run`.
             params: initial parameters; by default random ones that depend on the seed.
         """
         layouts = list(dict.fromkeys(task.layout for task in self.tasks))
-        told = 0 if groups[0].partners is None else len(self.tasks)
+        told = 0 if played[0].partner is None else len(self.tasks)
         world = overcooked_world(layouts, self.model.encoder, canonical=True, partners=told)
         method = get_method("rl2")(self.model, world)
-        trainer = PlayTrainer(method, self.training, PLAY, groups)
+        trainer = PlayTrainer(method, self.training, PLAY, played)
         task = TrainingTask(method, TrainingData(None, {}), self.training, self.settings, trainer)
         state = task.train(self.run_folder, params=params, done=self.step_progress(on_update))
         return trainer, state.params
@@ -209,9 +210,9 @@ class ResponseJob(EgoJob):
             if self.options.init not in models:
                 raise unknown("bundled model", self.options.init, models)
             params = read_trained(models[self.options.init].runs[track_of(task.layout.name)]).params
-        mates = [build_teammate(task.layout, task.teammate)] * self.options.tasks
-        group = TaskGroup([task.layout] * len(mates), task.teammate_kind, mates, False, task.layout.name)
-        trainer, params = self.train([group], on_update, params)
+        mate = build_teammate(task.layout, task.teammate)
+        played = PlayTask(task.layout, task.teammate_kind, mate, False, task.layout.name)
+        trainer, params = self.train([played] * self.options.tasks, on_update, params)
         modes = {}
         for mode, greedy in (("greedy", True), ("sampled", False)):
             policy = with_view(trained_policy(trainer.method, params, KEPT_STEPS, PlayMode(greedy=greedy)), "canonical")
@@ -297,13 +298,10 @@ def write_responses(
         folder: folder of the file.
         models: model -> task id -> mean return, see `include_models`.
     """
-    path, finished = folder / RESPONSES_FILE, defaultdict[tuple[str, ...], list[ResponseJob]](list)
-    for job in jobs:
-        if job.is_finished():
-            finished[tuple(task.task_id for task in job.tasks)].append(job)
+    path, finished = folder / RESPONSES_FILE, [job for job in jobs if job.is_finished()]
     known = {one.tasks: one for one in (read_best_responses(path).behaviours if path.is_file() else ())}
     found = {}
-    for ids, own in finished.items():
+    for ids, own in grouped(finished, lambda job: tuple(task.task_id for task in job.tasks)).items():
         before = known[ids].seeds if ids in known else ()
         found[ids] = choose_best_response(own[0].tasks, [*before, *map(trained_response, own)])
     new = {task for ids in found for task in ids}

@@ -7,19 +7,18 @@ through all episodes of a step, so with several the model learns to remember wha
 
 At first the model also imitates a script: the loss contains the cross-entropy of the script's actions in the states
 that the model visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al. 2011). The
-script is the oracle, which knows what the model has to find out; or the searcher, which finds out the dish of a task
-over its episodes.
+script is the oracle, which knows what the model has to find out. In tasks with a hidden dish, the script is the
+searcher, which finds out the dish over the episodes of a task.
 
 Shapes: `B` tasks, `E` episodes of a step, `T` steps of all these episodes, `S` size of the recurrent state.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -47,6 +46,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.utils.groups import grouped
 
 PLAY_REWARD_SCALE = 0.05
 """Factor of the rewards in returns and values: a delivery, which earns 20 points, becomes 1."""
@@ -86,33 +86,32 @@ class PlayState(NamedTuple):
     step: Int[Array, ""]
 
 
-@dataclass(frozen=True, eq=False)
-class TaskGroup:
-    """Training tasks with teammates of one kind.
+class PlayTask(NamedTuple):
+    """A training task. A training step plays episodes of every task.
 
     Attributes:
-        layouts: layout of each task.
-        family: kind of the teammates, such as "assembly_line".
-        teammates: teammate of each task; the policies share their functions.
+        layout: layout of the task.
+        family: kind of the teammate, such as "assembly_line".
+        teammate: the teammate; all teammates of a kind share their functions.
         hidden: whether recipe indicators are hidden from the model.
-        label: name of the layouts in the log.
-        partners: number of each task's teammate, for an informed model; None for other models.
-        ids: ids of the tasks that the teammates come from; empty if they are not recorded.
-        searched: whether the model imitates the searcher instead of the oracle, because each task wants one dish.
+        label: name of the layout in the log.
+        partner: number of the teammate, for an informed model; None for other models.
+        id: id of the task that the teammate comes from; empty if it is not recorded.
+        searched: whether the model imitates the searcher instead of the oracle.
     """
 
-    layouts: Sequence[Layout]
+    layout: Layout
     family: str
-    teammates: Sequence[Policy]
+    teammate: Policy
     hidden: bool
     label: str
-    partners: Sequence[int] | None = None
-    ids: Sequence[str] = ()
+    partner: int | None = None
+    id: str = ""
     searched: bool = False
 
     @property
     def name(self) -> str:
-        """Name of the group in the log: layouts and kind of teammates."""
+        """Name in the log of all tasks with this label and kind of teammate."""
         return f"{self.label} {self.family}"
 
 
@@ -121,8 +120,7 @@ def make_groups(
     tasks: int,
     shares: Mapping[str, float],
     hidden: Collection[str] = (),
-    searched: Collection[Layout] = (),
-) -> list[TaskGroup]:
+) -> list[list[PlayTask]]:
     """Return groups of tasks: divided among layouts by their shares, and equally among a layout's kinds of teammates.
 
     Args:
@@ -130,30 +128,27 @@ def make_groups(
         tasks: approximate total number of tasks; each group has at least one.
         shares: name of each layout -> relative number of its tasks.
         hidden: names of layouts whose recipe indicators the model does not see.
-        searched: layouts on which the model imitates the searcher.
     """
-    families: dict[str, int] = defaultdict(int)
-    for layout, _ in teammates:
-        families[layout.name] += 1
+    families = Counter(layout.name for layout, _ in teammates)
     total = sum(shares[name] for name in families)
     groups = []
     for (layout, family), policies in teammates.items():
         count = max(1, round(tasks * shares[layout.name] / total / families[layout.name]))
-        group = make_group([layout] * count, family, policies, layout.name in hidden, layout.name)
-        groups.append(replace(group, searched=layout in searched))
+        groups.append(make_group([layout] * count, family, policies, layout.name in hidden, layout.name))
     return groups
 
 
 def make_group(
     layouts: Sequence[Layout], family: str, teammates: Mapping[str, Policy], hidden: bool, label: str
-) -> TaskGroup:
+) -> list[PlayTask]:
     """Return a group of tasks on some layouts, with teammates that do not always follow their script.
 
     Teammates have equal numbers of tasks, up to a difference of one. With fewer tasks than teammates, some teammates
     have none.
 
     Args:
-        layouts, family, hidden, label: see `TaskGroup`.
+        layouts: layout of each task.
+        family, hidden, label: see `PlayTask`.
         teammates: task id -> teammate to choose from.
     """
     names, tasks = list(teammates), len(layouts)
@@ -161,7 +156,10 @@ def make_group(
     # The order is shuffled, because a teammate's behaviours depend on the index of its task.
     ids = [names[number] for number in np.random.default_rng(0).permutation(numbers)[:tasks]]
     mates = with_behaviours([teammates[task] for task in ids], mixed_chances(tasks))
-    return TaskGroup(layouts, family, mates, hidden, label, ids=ids)
+    return [
+        PlayTask(layout, family, mate, hidden, label, id=task)
+        for layout, mate, task in zip(layouts, mates, ids, strict=True)
+    ]
 
 
 class _Network(NamedTuple):
@@ -176,39 +174,34 @@ class _Network(NamedTuple):
 
 
 class _Player:
-    """Player of groups of tasks whose teammates share their functions: it plays their episodes in one program."""
+    """Player of tasks whose teammates share their functions: it plays their episodes in one program."""
 
-    def __init__(self, groups: Sequence[TaskGroup], method: Method, play: PlayOptions, mirror: bool) -> None:
-        self.groups, self._method, self._play, self._mirror = groups, method, play, mirror
-        teammates = [mate for group in groups for mate in group.teammates]
-        self.tasks = len(teammates)
-        sizes = [len(group.teammates) for group in groups]
-        self.ends = np.cumsum(sizes)[:-1]  # numbers of the first task of each group but the first
-        self._hidden = np.repeat([group.hidden for group in groups], sizes)
-        told = [group.partners for group in groups if group.partners is not None]
-        self._partners = jnp.asarray(np.concatenate(told), jnp.int32) if told else None
+    def __init__(self, tasks: Sequence[PlayTask], method: Method, play: PlayOptions, mirror: bool) -> None:
+        self.tasks, self._method, self._play, self._mirror = tasks, method, play, mirror
+        self._hidden = np.array([task.hidden for task in tasks])
+        informed = tasks[0].partner is not None
+        self._partners = jnp.array([task.partner for task in tasks], jnp.int32) if informed else None
         # Without changed views, the code for them is left out, which saves time in every step and in compilation.
         self._changes = mirror or bool(self._hidden.any())
-        played = [layout for group in groups for layout in group.layouts]
-        layouts = list(dict.fromkeys(played))
+        layouts = list(dict.fromkeys(task.layout for task in tasks))
         number = {layout: position for position, layout in enumerate(layouts)}
         several = len(layouts) > 1
         self.rollout = EvaluationRollout(
             layouts if several else layouts[0],
             _model_policy(method, self._changes),
-            teammates,
+            [task.teammate for task in tasks],
             get_protocol("seeded"),
-            np.array([number[layout] for layout in played]) if several else None,
+            np.array([number[task.layout] for task in tasks]) if several else None,
         )
         self.mates = self.rollout.teammate_params
-        self._searched = groups[0].searched
+        self._searched = tasks[0].searched
         own = self.rollout.layout
         self._script = searcher(own, advises=True) if self._searched else oracle(own)
 
     def start(self, key: Key[Array, ""]) -> RolloutState:
         """Return the state before the first episode of all tasks."""
         env_key, change_key = jax.random.split(key)
-        state = self.rollout.start(jax.random.split(env_key, self.tasks))
+        state = self.rollout.start(jax.random.split(env_key, len(self.tasks)))
         memory = state.ego._replace(change=self._draw_change(change_key), partner=self._partners)
         return state._replace(ego=memory._replace(searcher=self._new_searcher(key)))
 
@@ -216,15 +209,13 @@ class _Player:
         """Return the searcher's memory at the start of every task; None if the model imitates the oracle."""
         if not self._searched:
             return None
-        keys = jax.random.split(jax.random.fold_in(key, 1), self.tasks)
+        keys = jax.random.split(jax.random.fold_in(key, 1), len(self.tasks))
         return jax.vmap(self._script.init, in_axes=(None, 0))(self._script.params, keys)
 
     def _draw_change(self, key: Key[Array, ""]) -> ViewChange:
-        change = no_change(self.tasks)._replace(hidden=jnp.asarray(self._hidden))
-        if not self._mirror:
-            return change
-        upside_down, sideways = jax.random.bernoulli(key, 0.5, (2, self.tasks))
-        return change._replace(upside_down=upside_down, sideways=sideways)
+        chance = 0.5 if self._mirror else 0.0
+        upside_down, sideways = jax.random.bernoulli(key, chance, (2, len(self.tasks)))
+        return ViewChange(jnp.asarray(self._hidden), upside_down, sideways)
 
     def episodes(
         self, params: Any, mates: Any, state: RolloutState, key: Key[Array, ""]
@@ -244,8 +235,8 @@ class _Player:
         returns = jnp.swapaxes(played.reward.sum(axis=-1), 0, 1)
         # The episodes of a task follow one another: (E, B, 100, ...) becomes (B, E * 100, ...).
         played = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:]), played)
-        ended = jax.random.bernoulli(end_key, self._play.task_end, (self.tasks,))
-        sequences = self._sequences(params, state, after, played, expert.reshape(-1, self.tasks), ended)
+        ended = jax.random.bernoulli(end_key, self._play.task_end, (len(self.tasks),))
+        sequences = self._sequences(params, state, after, played, expert.reshape(-1, len(self.tasks)), ended)
         # A new task has the same teammate, but another view, a zero state and no previous step.
         memory = PlayerMemory(
             select_rows(ended, self._draw_change(change_key), after.ego.change),
@@ -254,7 +245,7 @@ class _Player:
             state.ego.partner,
             select_rows(ended, self._new_searcher(key), after.ego.searcher),
         )
-        before = select_rows(ended, no_outcome(self.tasks), after.before)
+        before = select_rows(ended, no_outcome(len(self.tasks)), after.before)
         return RolloutState(after.env, memory, before), sequences, returns
 
     def _sequences(
@@ -281,7 +272,7 @@ class _Player:
         )
         if self._changes:
             # Only the first of these steps can be the first step of a task.
-            started = jnp.ones((len(record) + 1, self.tasks), bool).at[0].set(state.ego.started)
+            started = jnp.ones((len(record) + 1, len(self.tasks)), bool).at[0].set(state.ego.started)
             steps = seen_steps(change, steps, started)
         # Log-probabilities and values are computed again with the operations of the loss, so that both agree exactly.
         _, logits, value = _Network(self._method.model).apply(params, state.ego.state, steps)
@@ -297,22 +288,23 @@ class _Player:
             # Returns end with a task, not with an episode, so that exploration is rewarded in later episodes.
             done=jnp.zeros(reward.shape, bool).at[-1].set(ended),
             hidden=state.ego.state[None],
-            partner=jnp.zeros((1, self.tasks), jnp.int32),  # one value function for all teammates
-            weight=jnp.ones((1, self.tasks)),
+            partner=jnp.zeros((1, len(self.tasks)), jnp.int32),  # one value function for all teammates
+            weight=jnp.ones((1, len(self.tasks))),
             last_value=value[-1][None],
             # The script's actions are converted from the environment's view to the model's view.
             expert=change.actions(expert),
         )
 
 
-def make_players(groups: Sequence[TaskGroup], method: Method, play: PlayOptions, mirror: bool) -> list[_Player]:
-    """Return the players, one for all groups of tasks that can share a compiled program."""
-    programs: dict[Any, list[TaskGroup]] = defaultdict(list)
-    for group in groups:
-        mate = group.teammates[0]
-        shared = (mate.init, mate.act) if mate.sees == "situation" else group.layouts[0]
-        programs[group.family, shared, group.searched].append(group)
-    return [_Player(own, method, play, mirror) for own in programs.values()]
+def make_players(tasks: Sequence[PlayTask], method: Method, play: PlayOptions, mirror: bool) -> list[_Player]:
+    """Return the players, one for all tasks that can share a compiled program."""
+
+    def program(task: PlayTask) -> tuple[Any, ...]:
+        mate = task.teammate
+        shared = (mate.init, mate.act) if mate.sees == "situation" else (task.layout,)
+        return (task.family, task.searched, *shared)
+
+    return [_Player(own, method, play, mirror) for own in grouped(tasks, program).values()]
 
 
 def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"]) -> StepInput:
@@ -358,7 +350,7 @@ class PlayTrainer:
         method: the method RL^2.
         options: options of the training; `steps`, `learning_rate`, `warmup`, `clip` and `seed` are used here.
         play: hyper-parameters of playing and learning.
-        groups: groups of tasks to play.
+        tasks: tasks to play.
         mirror: whether tasks are mirrored at random.
 
     Raises:
@@ -370,19 +362,19 @@ class PlayTrainer:
         method: Method,
         options: TrainOptions,
         play: PlayOptions,
-        groups: Sequence[TaskGroup],
+        tasks: Sequence[PlayTask],
         mirror: bool = False,
     ) -> None:
         self.method, self.options, self.play = method, options, play
-        self.players = make_players(groups, method, play, mirror)
-        self.tasks = sum(player.tasks for player in self.players)
-        if self.tasks < play.minibatches:
+        self.players = make_players(tasks, method, play, mirror)
+        self.tasks = [task for player in self.players for task in player.tasks]
+        if len(self.tasks) < play.minibatches:
             raise OptionError(
-                f"minibatches = {play.minibatches}: expected at most the {self.tasks} tasks that are played at once; "
-                f"give fewer --minibatches or a larger --batch-size"
+                f"minibatches = {play.minibatches}: expected at most the {len(self.tasks)} tasks that are played at "
+                f"once; give fewer --minibatches or a larger --batch-size"
             )
         # Minibatches have equal sizes, so a pass leaves out up to minibatches - 1 tasks, different ones in each pass.
-        learned = self.tasks - self.tasks % play.minibatches
+        learned = len(self.tasks) - len(self.tasks) % play.minibatches
         config = PPOConfig(
             total_steps=options.steps * learned * play.episodes * KEPT_STEPS,
             environments=learned,
@@ -438,22 +430,19 @@ class PlayTrainer:
         falling = jnp.maximum(0.0, 1.0 - state.step / (self.play.imitation_end * self.options.steps))
         weight = self.play.imitation * falling
         params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
-        by_name: dict[str, list[Array]] = defaultdict(list)
-        for player, own in zip(self.players, returns, strict=True):
-            for group, of_group in zip(player.groups, jnp.split(own, player.ends), strict=True):
-                by_name[group.name].append(of_group)
-        log |= {f"return {name}": jnp.concatenate(own).mean() for name, own in by_name.items()}
+        earned, names = jnp.concatenate(returns), np.array([task.name for task in self.tasks])
+        log |= {f"return {name}": earned[names == name].mean() for name in dict.fromkeys(names.tolist())}
         return PlayState(params, optimizer, tasks, state.step + 1), log
 
-    def measure(self, params: Any, episodes: int, seed: int) -> dict[TaskGroup, np.ndarray]:
-        """Return group -> returns of sampled actions in new episodes, float64 (tasks, episodes).
+    def measure(self, params: Any, episodes: int, seed: int) -> np.ndarray:
+        """Return the returns of sampled actions in new episodes of `self.tasks`, float64 (tasks, episodes).
 
         Args:
             params: parameters of the model.
             episodes: number of episodes of each task.
             seed: seed of the episodes.
         """
-        found: dict[TaskGroup, np.ndarray] = {}
+        found = []
         keys = [jax.random.fold_in(jax.random.key(seed), number) for number in range(len(self.players))]
         states = [jax.jit(player.start)(key) for player, key in zip(self.players, keys, strict=True)]
         for player, key, state, play in zip(self.players, keys, states, self.programs(params, states), strict=True):
@@ -461,9 +450,8 @@ class PlayTrainer:
             for step in range(-(-episodes // self.play.episodes)):
                 state, _, own = play(params, player.mates, state, jax.random.fold_in(key, step + 1))
                 returns.append(np.asarray(own, np.float64))
-            played = np.concatenate(returns, axis=-1)[:, :episodes]
-            found |= zip(player.groups, np.split(played, player.ends), strict=True)
-        return found
+            found.append(np.concatenate(returns, axis=-1)[:, :episodes])
+        return np.concatenate(found)
 
     def programs(self, params: Any, tasks: Sequence[RolloutState]) -> list[Callable[..., Any]]:
         """Return the compiled function `episodes` of each player, for its running tasks.
@@ -484,7 +472,7 @@ class PlayTrainer:
         self, params: Any, optimizer: Any, parts: tuple[Sequences, ...], key: Key[Array, ""], weight: Array
     ) -> tuple[Any, Any, dict[str, Array]]:
         played: Sequences = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *parts)
-        played = played._replace(imitation=jnp.full((1, self.tasks), weight))
+        played = played._replace(imitation=jnp.full((1, len(self.tasks)), weight))
         params, optimizer, log = self.ppo.learn(params, optimizer, played, key)
         config = self.ppo.config
         total = log["policy_loss"] + config.value * log["value_loss"] - config.entropy * log["entropy"]

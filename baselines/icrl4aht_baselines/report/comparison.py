@@ -362,7 +362,7 @@ def describe_trainings() -> str:
     return (
         f"Each of {len(behaviours)} behaviours has a best response from {runs} training "
         f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. For {better} behaviours a stored "
-        f"model earns more, and its return counts instead."
+        f"model earns more, so B is the return of that model."
     )
 
 

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pandas as pd
 from icrl4aht_generation.learners.config import EncoderKind
 from icrl4aht_generation.learners.resume import Checkpoints, differing_settings
@@ -20,7 +19,7 @@ from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import PLAYING, get_method, overcooked_world
 from icrl4aht_baselines.methods.tokens import BatchView, plain_view
 from icrl4aht_baselines.methods.view_change import changed_view, number_layouts
-from icrl4aht_baselines.training.options import ALL_LAYOUTS, FILTERS, HistoryOptions, TrainOptions
+from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, read_config
 from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
@@ -34,8 +33,12 @@ from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.splitting import choose_histories, choose_teammates
 from icrl4aht_data.utils.files import file_hash, json_hash
 
-_CELL_FIELDS = {"layout": "layout", "split": "split", "family": FILTERS["teammate_family"]} | {
-    name: FILTERS[name] for name in ("algorithm", "source")
+_CELL_FIELDS = {
+    "layout": "layout",
+    "split": "split",
+    "family": "teammate_family",
+    "algorithm": "teammate_kind",
+    "source": "source",
 }
 """Name in an entry of `training_cells` -> field of the release's index."""
 
@@ -53,6 +56,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
         histories: choice of the histories to train on.
 
     Raises:
+        UnknownNameError: if a filter has an unknown value.
         EmptySelectionError: if no history passes a filter.
         OptionError: if a window or a context is longer than a history, own channels are requested for layouts with
             different numbers of channels, or labels are requested for a method that uses none.
@@ -143,38 +147,24 @@ def _load_histories(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]
             f"{found.layouts[0].name}"
         )
     options: Any = {"obs": "state" if found.has_states else None, "channels": channels}
-    filters: Any = {FILTERS[name]: list(values) for name, values in histories.filters.items()}
     validation = None
     with suppress(EmptySelectionError):
-        validation = release.filter(split="validation", layout=[one.name for one in found.layouts], **filters)
+        validation = release.filter(split="validation", layout=[one.name for one in found.layouts], **histories.filters)
         validation = validation.with_options(**options)
     return found.with_options(**options), validation
 
 
-def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -> Dataset:
+def filter_histories(dataset: Dataset, filters: Mapping[str, Any]) -> Dataset:
     """Return the histories that pass all filters, see `HistoryOptions.filters`.
 
     Raises:
+        UnknownNameError: if a value exists neither in the release nor in the benchmark.
         EmptySelectionError: if no history has one of the values, or no history passes all filters.
     """
-    passing = np.ones(len(dataset), bool)
     for name, values in filters.items():
-        column = dataset.column(FILTERS[name])
-        passing &= np.isin(column, values)
-        found = sorted(set(column.tolist()) - {""}) or ["none"]
-        for value in values:
-            if value not in found:
-                raise EmptySelectionError(
-                    f"{name} = {value}: not in {dataset!r}, which has {', '.join(found)}; choose one of these, or "
-                    f"another layout or release"
-                )
-    if not passing.any():
-        wanted = ", ".join(f"{name} = {' or '.join(values)}" for name, values in filters.items())
-        raise EmptySelectionError(
-            f"{wanted}: no history of {dataset!r} has all of these values; leave out an option, or choose another "
-            f"layout or release"
-        )
-    return dataset.select(passing) if filters else dataset
+        for value in values:  # a value without histories is an error, even if there are histories with the other values
+            dataset.filter(**{name: value})
+    return dataset.filter(**filters)
 
 
 def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Any
 
 from msgspec import Meta
 
@@ -121,9 +121,8 @@ class ResponseOptions:
 SAVE_MINUTES = 5.0
 """Largest number of minutes between checkpoints, which are also written every `save_every` steps."""
 
-FILTERS = {name: name for name in ("teammate_family", "source", "label_view")} | {"algorithm": "teammate_kind"}
-"""Field of `HistoryOptions` -> field of a release's index that is filtered by its values."""
-
+FILTERS = ("teammate_family", "source", "label_view", "algorithm")
+"""Fields of `HistoryOptions` with the accepted values of an index field of this name, see `Dataset.filter`."""
 
 ALL_LAYOUTS = "all"
 """Value of `layouts` for all layouts with histories that pass the other filters."""
@@ -201,6 +200,6 @@ class HistoryOptions:
             raise OptionError(f"layouts = {', '.join(self.layouts)}: expected names of layouts, or {ALL_LAYOUTS} alone")
 
     @property
-    def filters(self) -> dict[str, tuple[str, ...]]:
-        """Name of a field in `FILTERS` -> accepted values, for the fields that are set."""
+    def filters(self) -> dict[str, Any]:
+        """Name of a field in `FILTERS` -> tuple of accepted values, for the fields that are set."""
         return {name: getattr(self, name) for name in FILTERS if getattr(self, name)}

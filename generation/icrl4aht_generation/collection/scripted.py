@@ -76,7 +76,7 @@ def play_histories(
             for number, (batch, episodes) in enumerate(played):
                 jax.block_until_ready(episodes)
                 with writer.recording():
-                    for name, values in episodes._asdict().items():
+                    for name, values in episodes.items():
                         writer.arrays[name].reshape(*schedules.shape, *values.shape[1:])[batch] = values
                 timing = writer.timing(len(batch[0]) * KEPT_STEPS)
                 writer.log.write(timing={"update": number} | timing)

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Int8, Key, UInt8
+from jaxtyping import Array, Float, Int, Key
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
@@ -59,26 +59,6 @@ def noise_schedules(config: NoiseConfig, seed: int) -> np.ndarray:
     return np.round(end + (start - end) * (1 - fallen) ** power, 6).astype(np.float32)
 
 
-class ScriptedEpisodes(NamedTuple):
-    """M recorded episodes of 100 steps in which a script played the ego.
-
-    Attributes:
-        state: uint8 (M, 100, S), state records before each step.
-        actions: int8 (M, 100), the ego's actions: the script's or random ones.
-        teammate_actions: int8 (M, 100), the teammate's actions.
-        rewards: int8 (M, 100), the team's rewards without shaping.
-        episode_end_state: uint8 (M, S), state records after the last step.
-        script_actions: int8 (M, 100), the script's actions.
-    """
-
-    state: UInt8[Array, "M 100 S"]
-    actions: Int8[Array, "M 100"]
-    teammate_actions: Int8[Array, "M 100"]
-    rewards: Int8[Array, "M 100"]
-    episode_end_state: UInt8[Array, "M S"]
-    script_actions: Int8[Array, "M 100"]
-
-
 class NoisyChoice(NamedTuple):
     """Actions of a scripted ego in one step of M environments, some replaced by random actions.
 
@@ -108,7 +88,7 @@ def scripted_batches(source: str, config: NoiseConfig) -> list[ScriptedBatch]:
 
 def play_scripted_histories(
     layout: Layout, teammate: Policy, seed: int, source: str, batches: Sequence[ScriptedBatch], schedules: np.ndarray
-) -> Iterator[tuple[ScriptedBatch, ScriptedEpisodes]]:
+) -> Iterator[tuple[ScriptedBatch, dict[str, Array]]]:
     """Play batches of a task's episodes, with one compilation per teammate family and size class of layouts.
 
     The device plays the next batch while the caller uses the yielded batch.
@@ -122,7 +102,8 @@ def play_scripted_histories(
         schedules: float32 (N, E), the chance of a random action in every episode.
 
     Yields:
-        Each batch with its recorded episodes.
+        Each batch with the arrays of its M episodes of 100 steps: those of `task_folder.HISTORY_ARRAYS` and
+        `script_actions`, int8 (M, 100), the script's actions. The first axis is M instead of (N, E).
     """
     padded = padded_layout(layout, by_size=True) if teammate.sees == "situation" else unpadded_layout(layout)
     tables, expert, own = padded
@@ -134,10 +115,10 @@ def play_scripted_histories(
         where = history.astype(np.int32), episode.astype(np.int32)
         chance = schedules[history, episode]
         played, memory = play(tables, params, teammate.params, _task_keys(seed)[1], *where, chance, memory)
-        state, end = played.state[..., own], played.episode_end_state[..., own]
+        records = {name: played[name][..., own] for name in ("state", "episode_end_state")}
         if last is not None:
             yield last
-        last = (history, episode), played._replace(state=state, episode_end_state=end)
+        last = (history, episode), played | records
     if last is not None:
         yield last
 
@@ -164,7 +145,7 @@ def _episode_keys(key: Key[Array, ""], history: Any, episode: Any) -> Key[Array,
 
 
 @lru_cache(maxsize=64)
-def _compiled_play(teammate: Policy, searches: bool) -> Callable[..., tuple[ScriptedEpisodes, Any]]:
+def _compiled_play(teammate: Policy, searches: bool) -> Callable[..., tuple[dict[str, Array], Any]]:
     """Return a compiled function that plays a batch of episodes and returns the searcher's memories after them.
 
     The function ignores the given memories in the first episode of a history.
@@ -187,14 +168,14 @@ def _compiled_play(teammate: Policy, searches: bool) -> Callable[..., tuple[Scri
         def by_episode(values: Array) -> Array:
             return values.swapaxes(0, 1).astype(jnp.int8)
 
-        episodes = ScriptedEpisodes(
-            state=rollout.record.swapaxes(0, 1),
-            actions=by_episode(choice.action),
-            teammate_actions=by_episode(rollout.actions[..., TEAMMATE]),
-            rewards=by_episode(rollout.reward),
-            episode_end_state=carry.env.record,  # not reset yet, as the environment's episodes are longer
-            script_actions=by_episode(choice.clean),
-        )
+        episodes = {
+            "state": rollout.record.swapaxes(0, 1),
+            "actions": by_episode(choice.action),
+            "teammate_actions": by_episode(rollout.actions[..., TEAMMATE]),
+            "rewards": by_episode(rollout.reward),
+            "episode_end_state": carry.env.record,  # not reset yet, as the environment's episodes are longer
+            "script_actions": by_episode(choice.clean),
+        }
         return episodes, carry.memories[EGO] if searches else None
 
     return play

@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -59,30 +59,22 @@ LABELLER_RETURNS = "labeller_returns.json"
 _LINE_BYTES = 600  # maximum size of an update's lines in the files of metrics and timing
 
 
+HISTORY_ARRAYS = ("state", "actions", "teammate_actions", "rewards", "episode_end_state")
+"""Arrays of N histories with E episodes and T = 100 E steps, in every artefact:
+
+    state               uint8 (N, T, S), state records before each step
+    actions             int8 (N, T), the ego's sampled actions
+    teammate_actions    int8 (N, T), the teammate's actions
+    rewards             int8 (N, T), the team's rewards without shaping
+    episode_end_state   uint8 (N, E, S), state records after the last stored step of each episode
+"""
+
 SCRIPT_ARRAYS = ("script_actions", "noise")
-"""Arrays in artefacts of scripted sources that `HistoryArrays` does not list, see `collection.scripted`."""
-
-
-class HistoryArrays(NamedTuple):
-    """Arrays of N histories with E episodes and T = 100 E steps; NumPy arrays or memory maps.
-
-    Attributes:
-        state: uint8 (N, T, S), state records before each step.
-        actions: int8 (N, T), the ego's sampled actions.
-        teammate_actions: int8 (N, T), the teammate's actions.
-        rewards: int8 (N, T), the team's rewards without shaping.
-        episode_end_state: uint8 (N, E, S), state records after the last stored step of each episode.
-    """
-
-    state: np.ndarray
-    actions: np.ndarray
-    teammate_actions: np.ndarray
-    rewards: np.ndarray
-    episode_end_state: np.ndarray
+"""Further arrays in artefacts of scripted sources, see `collection.scripted`."""
 
 
 def array_shapes(layout: Layout, histories: int, episodes: int) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Return the shape and dtype of every field of `HistoryArrays`."""
+    """Return the shape and dtype of each of `HISTORY_ARRAYS`."""
     n, size = histories, record_size(layout)
     steps = (n, episodes * KEPT_STEPS)
     return {
@@ -99,8 +91,8 @@ def arrays_bytes(shapes: Mapping[str, tuple[tuple[int, ...], str]]) -> int:
     return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
 
 
-def record_rollout(histories: HistoryArrays, update: int, rollout: Rollout) -> None:
-    """Write those steps of a rollout that the histories store.
+def record_rollout(histories: Mapping[str, np.ndarray], update: int, rollout: Rollout) -> None:
+    """Write those steps of a rollout that the histories store into `HISTORY_ARRAYS`.
 
     All environments start episodes in the same steps, so a step's number determines its episode and its step in the
     episode. Writing a rollout twice changes nothing, so a resumed task may write it again.
@@ -108,17 +100,17 @@ def record_rollout(histories: HistoryArrays, update: int, rollout: Rollout) -> N
     length = rollout.record.shape[0]
     step = np.arange(update * length, (update + 1) * length)
     episode, clock = step // EPISODE_STEPS, step % EPISODE_STEPS
-    complete = episode < histories.episode_end_state.shape[1]
+    complete = episode < histories["episode_end_state"].shape[1]
     kept = complete & (clock < KEPT_STEPS)
     after = complete & (clock == KEPT_STEPS)
     record = np.asarray(rollout.record).swapaxes(0, 1)
     actions = np.asarray(rollout.actions).swapaxes(0, 1)
     to = episode[kept] * KEPT_STEPS + clock[kept]
-    histories.state[:, to] = record[:, kept]
-    histories.actions[:, to] = actions[:, kept, EGO]
-    histories.teammate_actions[:, to] = actions[:, kept, TEAMMATE]
-    histories.rewards[:, to] = np.asarray(rollout.reward).swapaxes(0, 1)[:, kept]
-    histories.episode_end_state[:, episode[after]] = record[:, after]
+    histories["state"][:, to] = record[:, kept]
+    histories["actions"][:, to] = actions[:, kept, EGO]
+    histories["teammate_actions"][:, to] = actions[:, kept, TEAMMATE]
+    histories["rewards"][:, to] = np.asarray(rollout.reward).swapaxes(0, 1)[:, kept]
+    histories["episode_end_state"][:, episode[after]] = record[:, after]
 
 
 def partial_folder(folder: Path) -> Path:
@@ -155,7 +147,7 @@ def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
 
 def hashed_files(work: Work, profile: Profile) -> list[str]:
     """Return the names of the files that an artefact's metadata lists with their hashes, sorted."""
-    files = {METRICS, *(f"{name}.npy" for name in HistoryArrays._fields)}
+    files = {METRICS, *(f"{name}.npy" for name in HISTORY_ARRAYS)}
     if work.source in SCRIPTED_SOURCES:
         return sorted(files | {f"{name}.npy" for name in SCRIPT_ARRAYS})
     count = len(checkpoint_updates(profile.ego_on(work.task.layout.name)))
@@ -329,7 +321,7 @@ class ArtefactWriter(ArrayWriter):
         """Record one update, and return the average steps per second so far."""
         jax.block_until_ready((rollout, metrics))
         with self.recording():
-            record_rollout(HistoryArrays(**self.arrays), number, rollout)
+            record_rollout(self.arrays, number, rollout)
         line = {"update": number, "step": (number + 1) * self._config.steps_per_update}
         line |= {name: float(value) for name, value in metrics.items()}
         if not line.get("episodes", 1):

@@ -28,6 +28,7 @@ from icrl4aht_data.overcooked.cells import COOKED, GOAL, PLATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import State, columns, ingredient_count, possible_recipes, unpack
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE, OracleMemory, oracle_params
+from icrl4aht_generation.paths import Scene
 from icrl4aht_generation.policy import Policy, Situation
 
 _FLAGS = np.uint8(PLATE | COOKED)
@@ -130,13 +131,13 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
     had = old.hands[TEAMMATE]
     into_pot = jnp.sum(ingredient_count(new.pot_items)) > jnp.sum(ingredient_count(old.pot_items))
     put = (had >> 2 > 0) & (had & PLATE == 0) & (new.hands[TEAMMATE] == 0) & into_pot
-    seen = memory.seen + jnp.where(put, _pieces(had), 0)
-    fits = (_pieces(dishes) @ seen) / jnp.maximum(seen.sum(), 1)
+    seen = memory.seen + jnp.where(put, Scene.counts(had), 0)
+    fits = (Scene.counts(dishes) @ seen) / jnp.maximum(seen.sum(), 1)
     score = jnp.where(paid, 100.0, fits + 0.1 * memory.order) - 1000.0 * (refused | (dishes == _NO_DISH))
     idle = jnp.all(new.pot_items == 0) & (new.hands[EGO] == 0)
     change = idle | refused[memory.belief] | paid.any()
     if advises:
-        fitting = jnp.all(_pieces(dishes) >= _begun_dish(new), axis=-1)
+        fitting = jnp.all(Scene.counts(dishes) >= _begun_dish(new), axis=-1)
         score = score - 50.0 * ~fitting  # counts more than the teammate's hints, and less than what was paid or refused
         change |= ~fitting[memory.belief]
     belief = jnp.where(change, score.argmax(), memory.belief)
@@ -146,12 +147,7 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
 def _begun_dish(state: State) -> Int[Array, " 3"]:
     """Return the pieces of each ingredient in the dish that the ego carries, or in the fullest pot and in its hand."""
     hand, counts = state.hands[EGO], ingredient_count(state.pot_items)
-    in_hand = _pieces(hand & np.uint8(0xFF - COOKED))
-    in_pot = _pieces(state.pot_items[jnp.argmax(counts)] & np.uint8(0xFF - COOKED))
+    in_hand = Scene.counts(hand & np.uint8(0xFF - COOKED))
+    in_pot = Scene.counts(state.pot_items[jnp.argmax(counts)] & np.uint8(0xFF - COOKED))
     adds = (hand & PLATE == 0) & (counts.max() < 3)
     return jnp.where(hand & COOKED > 0, in_hand, in_pot + jnp.where(adds, in_hand, 0))
-
-
-def _pieces(items: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
-    """Return the number of pieces of each ingredient in items."""
-    return (items[..., None] >> np.array([2, 4, 6], np.uint8) & 3).astype(jnp.int32)

@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor
 from concurrent.futures import wait as wait_for
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from threading import current_thread, main_thread
@@ -34,9 +34,6 @@ from icrl4aht_generation.jobs.ray_executor import run_on_ray
 _POLL_SECONDS = 1.0
 _QUICK_JOBS = 256  # a process is replaced after this number of jobs to release its memory
 
-_Pool = tuple[int | None, ProcessPoolExecutor]
-"""Number of XLA threads and a pool of a single process, since a killed worker breaks its whole pool."""
-
 
 def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOptions) -> None:
     """Run every job that is unfinished.
@@ -44,7 +41,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
     Jobs that another process is running are skipped at first, and awaited at the end.
 
     Args:
-        jobs: jobs of the queue.
+        jobs: jobs of the queue, all with the same number of XLA threads.
         out: folder of the log of failures.
         console: where outcomes are printed.
         options: how to run the jobs.
@@ -137,7 +134,7 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
         # By default SIGTERM would end this process and leave its workers running.
         before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     waiting, running = list(jobs), {}
-    idle: list[_Pool] = []
+    idle: list[ProcessPoolExecutor] = []
     attempts = dict.fromkeys((job.name for job in jobs), 0)
     try:
         while waiting or running:
@@ -153,7 +150,7 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
                 if job.is_quick and not isinstance(error, BrokenExecutor):
                     idle.append(pool)
                 else:
-                    pool[1].shutdown(wait=False)
+                    pool.shutdown(wait=False)
                 if error is None:
                     yield JobOutcome(job, future.result(), attempts[job.name])
                 elif not isinstance(error, Exception):  # no retry after an interrupt or exit of the worker
@@ -164,7 +161,7 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
                     yield _failed_outcome(job, attempts[job.name], error)
             board.show_recorded(job for job, _ in running.values())
     finally:
-        for _, pool in (*(pool for _, pool in running.values()), *idle):
+        for pool in (*(pool for _, pool in running.values()), *idle):
             pool.shutdown(wait=False, cancel_futures=True)
         if running:
             for process in multiprocessing.active_children():
@@ -173,20 +170,17 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
             signal.signal(signal.SIGTERM, before)
 
 
-def _start_job(job: Job, wait: bool, idle: list[_Pool]) -> tuple[Future[Any], _Pool]:
-    """Start a job in an idle process with the same number of XLA threads, or in a new process."""
-    for number, (threads, pool) in enumerate(idle):
-        if threads == job.xla_threads:
-            del idle[number]
-            try:
-                return pool.submit(run_in_worker, job, wait), (threads, pool)
-            except BrokenExecutor:  # the idle process was killed
-                break
-    if idle:  # an idle process holds memory that the new process may need
-        idle.pop()[1].shutdown()
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(1, context, max_tasks_per_child=_QUICK_JOBS)
-    return pool.submit(run_in_worker, job, wait), (job.xla_threads, pool)
+def _start_job(job: Job, wait: bool, idle: list[ProcessPoolExecutor]) -> tuple[Future[Any], ProcessPoolExecutor]:
+    """Start a quick job in an idle process if possible, and any other job in a new process."""
+    if idle:
+        pool = idle.pop()
+        if job.is_quick:
+            with suppress(BrokenExecutor):  # the idle process was killed
+                return pool.submit(run_in_worker, job, wait), pool
+        pool.shutdown()  # an idle process holds memory that the new process may need
+    # A pool has a single process, since a killed worker breaks its whole pool.
+    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), max_tasks_per_child=_QUICK_JOBS)
+    return pool.submit(run_in_worker, job, wait), pool
 
 
 def _failed_outcome(job: Job, attempts: int, error: BaseException) -> JobOutcome:

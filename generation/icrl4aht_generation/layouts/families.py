@@ -57,18 +57,15 @@ def generate_layouts(family: str, seed: int, count: int, *, split: str | None = 
     seed, count = check_int("seed", seed, 0), check_int("count", count, 0)
     if count > MOST_LAYOUTS:
         raise OptionError(f"count = {count}: a family has at most {MOST_LAYOUTS} layouts of one seed; ask for fewer")
-    found: list[Layout] = []
     numbered = islice(_named_layouts(family, seed), MOST_LAYOUTS)  # the limit counts layouts of all splits
-    while len(found) < count:
-        layout = next(numbered, None)
-        if layout is None:
-            kept = "" if split is None else f" of split {split}"
-            raise OptionError(
-                f"family {family}, seed {seed}: found only {len(found)} layouts{kept}, expected {count}; ask for "
-                f"fewer, or give another seed or family"
-            )
-        if split is None or split_of(layout) == split:
-            found.append(layout)
+    of_split = (layout for layout in numbered if split is None or split_of(layout) == split)
+    found = list(islice(of_split, count))
+    if len(found) < count:
+        kept = "" if split is None else f" of split {split}"
+        raise OptionError(
+            f"family {family}, seed {seed}: found only {len(found)} layouts{kept}, expected {count}; ask for fewer, or "
+            f"give another seed or family"
+        )
     return found
 
 

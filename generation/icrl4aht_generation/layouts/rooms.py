@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_erosion, label
+from scipy.ndimage import binary_erosion, find_objects, label
 
 from icrl4aht_generation.layouts.fixtures import LayoutDraw, furnish_rooms
 from icrl4aht_generation.layouts.grids import canonical_floor, neighbours
@@ -54,14 +54,8 @@ def _shared_room(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         surrounded = np.argwhere(binary_erosion(floor, np.ones((3, 3), bool)))
         if len(surrounded):
             floor[tuple(rng.choice(surrounded))] = False
-    floor = _crop(floor)
+    floor = np.pad(floor[find_objects(floor.astype(int))[0]], 1)  # cropped to its cells and a border of walls
     return floor, floor
-
-
-def _crop(floor: np.ndarray) -> np.ndarray:
-    """Return a floor cropped to its cells and a border of walls."""
-    rows, columns = np.flatnonzero(floor.any(axis=1)), np.flatnonzero(floor.any(axis=0))
-    return np.pad(floor[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 1)
 
 
 def _two_rooms(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -41,8 +41,6 @@ from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, referen
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate
 from icrl4aht_generation.teammates.spread import find_measured
 
-_DIGITS = 4
-
 T = TypeVar("T")
 
 
@@ -201,8 +199,7 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
     layout = tasks[0].layout
     if learned and layout.name in TESTED_ON:  # other layouts have no test teammates to compare with
         mates = [build_teammate(layout, task.teammate, suite=suite) for task in learned]
-        for task, near in zip(learned, nearest_test(layout, mates), strict=True):
-            nearest[task.task_id] = NearestTest(near.teammate, round(near.distance, _DIGITS), near.behaviour)
+        nearest = dict(zip((task.task_id for task in learned), nearest_test(layout, mates), strict=True))
     return [TeammateFacts(returns[task.task_id], nearest.get(task.task_id)) for task in tasks]
 
 

@@ -28,7 +28,7 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder, check_target
 from icrl4aht_generation.collection.curate import filter_report, oracle_labels, relabel, select_streams, stream_returns
 from icrl4aht_generation.collection.task import TEAMMATE_NOISE
-from icrl4aht_generation.collection.task_folder import METADATA, HistoryArrays
+from icrl4aht_generation.collection.task_folder import HISTORY_ARRAYS, METADATA
 from icrl4aht_generation.learners.checkpoint import load_policy
 from icrl4aht_generation.populations.select import THRESHOLD
 from icrl4aht_generation.populations.train import population_threads
@@ -295,7 +295,7 @@ def _labels(found: TaskHistories, labeller: Path | None) -> Callable[[int, np.nd
 def _recorded_histories(found: TaskHistories) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
     """Yield learner, stream and memory-mapped arrays of each selected history."""
     for learner, (folder, streams) in enumerate(zip(found.folders, found.streams, strict=True)):
-        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in HistoryArrays._fields}
+        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in HISTORY_ARRAYS}
         dones = episode_ends(arrays["actions"].shape[1], KEPT_STEPS)
         for stream in streams.tolist():
             yield learner, stream, {name: array[stream] for name, array in arrays.items()} | {"dones": dones}

@@ -99,7 +99,7 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
     distances = distances_to_tests(tested, actions)
     nearest = distances.argmin(axis=1)
     return [
-        NearestTest(INSTANCE_NAMES[k], float(distances[number, k]), behaviour)
+        NearestTest(INSTANCE_NAMES[k], round(float(distances[number, k]), _DIGITS), behaviour)
         for number, (k, behaviour) in enumerate(zip(nearest, group_behaviours(actions), strict=True))
     ]
 

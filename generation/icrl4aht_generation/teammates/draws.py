@@ -209,12 +209,9 @@ def diverse_tasks(track: str, split: str) -> list[Task]:
 
 def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
     """Return the draw that a teammate entry describes, or None if the table has no such draw."""
-    family, seed, theta_id = (teammate.get(name) for name in ("family", "base_seed", "theta_id"))
-    if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
-        return None
-    for draw in read_draws(layout, str(family), seed):
-        if draw.theta_id == theta_id:
-            sampled = sample_teammate(draw.family, draw.theta_id, ranges_of(seed), seed)
+    for draw in _bundled_draws().get((layout, teammate["family"], teammate["base_seed"]), ()):
+        if draw.theta_id == teammate["theta_id"]:
+            sampled = sample_teammate(draw.family, draw.theta_id, ranges_of(draw.base_seed), draw.base_seed)
             return draw if equal_parameters(sampled["theta"], teammate["theta"]) else None
     return None
 

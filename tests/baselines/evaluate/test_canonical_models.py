@@ -17,8 +17,8 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, RolloutState
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.reference import model_card
-from icrl4aht_baselines.report.results import note_results, read_run
+from icrl4aht_baselines.reference import ReferenceOutcome, write_bundled_card
+from icrl4aht_baselines.report.results import note_results
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_generation.env import EnvState
@@ -69,7 +69,11 @@ def test_model_is_evaluated_on_a_layout_without_training_data(trained_run, tmp_p
     results = evaluate(agent.name, agent.make, [task], SHORT, details=agent.details, out=tmp_path)
     assert np.shape(results[0].returns) == (1, 1)
     note_results(tmp_path, folder)
-    card = model_card(read_run(tmp_path), "x-y", "make")
+    outcome = ReferenceOutcome(
+        "x-y", "layout", folder, dict.fromkeys(("test-seeded", "validation", "diverse"), tmp_path)
+    )
+    (tmp_path / "x-y").mkdir()
+    card = write_bundled_card("x-y", [outcome], tmp_path).read_text(encoding="utf-8")
     assert "| cramped_down | `" in card and ", manifest with SHA-256 `" in card
 
 

@@ -46,7 +46,7 @@ def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, 
     """The release with the training data is read over HTTP."""
     release, trained, results = tmp_path / "release", tmp_path / "run", tmp_path / "results"
     random_release(release, layouts=("cramped_up",))
-    monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 8, 5, heads=2, encoder="mlp"))
+    monkeypatch.setitem(SIZES, "tiny", ModelSize({"layers": 1, "width": 8, "heads": 2, "encoder": "mlp"}, {"steps": 5}))
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     with http_server(release) as server:
         small = "--steps 1 --context 8 --batch-size 2 --validation-batches 1 --next-obs"

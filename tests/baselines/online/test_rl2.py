@@ -22,8 +22,8 @@ from icrl4aht_baselines.methods.view_change import ViewChange
 from icrl4aht_baselines.online.prepare import FLAT_SHARE, REARRANGED_SHARE, _shares, prepare_play
 from icrl4aht_baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
+    PlayTask,
     PlayTrainer,
-    TaskGroup,
     make_groups,
     make_players,
     seen_steps,
@@ -60,8 +60,8 @@ def teammates(count: int) -> dict[str, Policy]:
 
 @pytest.fixture(scope="module")
 def trainer() -> PlayTrainer:
-    groups = make_groups({(LAYOUT, "assembly_line"): teammates(2)}, 8, {LAYOUT.name: 1.0}, searched=[LAYOUT])
-    made = PlayTrainer(METHOD, OPTIONS, PLAY, groups, mirror=True)
+    (tasks,) = make_groups({(LAYOUT, "assembly_line"): teammates(2)}, 8, {LAYOUT.name: 1.0})
+    made = PlayTrainer(METHOD, OPTIONS, PLAY, [task._replace(searched=True) for task in tasks], mirror=True)
     made.init = jax.jit(made._initial_state)  # compiled once for several tests
     return made
 
@@ -185,14 +185,9 @@ def test_batch_of_several_layouts_gives_the_same_results_as_single_layouts():
     """Tasks of a layout give equal results in a batch of several layouts and in a batch of this layout alone."""
     layouts = rearranged_layouts(LAYOUT, 3)[::2]
     mate = build_teammate(None, sample_teammate("assembly_line", 0, "train"))
-    mixed = [
-        TaskGroup([layouts[0]], "assembly_line", [mate], True, "first"),
-        TaskGroup([layouts[1]] * 2, "assembly_line", [mate] * 2, True, "second"),
-    ]
-    (player,) = make_players(mixed, METHOD, PLAY, mirror=False)
-    (alone,) = make_players(
-        [TaskGroup([layouts[1]] * 3, "assembly_line", [mate] * 3, True, "")], METHOD, PLAY, mirror=False
-    )
+    first, second = (PlayTask(layout, "assembly_line", mate, True, layout.name) for layout in layouts)
+    (player,) = make_players([first, second, second], METHOD, PLAY, mirror=False)
+    (alone,) = make_players([second] * 3, METHOD, PLAY, mirror=False)
     params, key = METHOD.init(jax.random.key(0)), jax.random.key(1)
     (after, found, returns), (alone_after, expected, alone_returns) = (
         jax.jit(one.episodes)(params, one.mates, jax.jit(one.start)(key), key) for one in (player, alone)
@@ -208,7 +203,7 @@ class TestTaskGroups:
         wide = get_layout("demo_wide")
         mates = {(LAYOUT, "a"): teammates(1), (LAYOUT, "b"): teammates(1), (wide, "a"): teammates(3)}
         groups = make_groups(mates, 40, {LAYOUT.name: 1.0, wide.name: 0.25}, hidden=[wide.name])
-        assert [(group.name, len(group.teammates), group.hidden) for group in groups] == [
+        assert [(group[0].name, len(group), group[0].hidden) for group in groups] == [
             ("cramped_up a", 16, False),
             ("cramped_up b", 16, False),
             ("demo_wide a", 8, True),
@@ -219,18 +214,18 @@ class TestTaskGroups:
             make_groups({(LAYOUT, "a"): teammates(mates)}, tasks, {LAYOUT.name: 1.0})
             for mates, tasks in ((3, 8), (10, 4), (3, 60))
         )
-        assert sorted(collections.Counter(eight.ids).values()) == [2, 3, 3]
-        assert len(set(four.ids)) == 4
+        assert sorted(collections.Counter(task.id for task in eight).values()) == [2, 3, 3]
+        assert len({task.id for task in four}) == 4
         found: dict[bytes, set[bytes]] = {}
-        for mate in group.teammates:
+        for mate in (task.teammate for task in group):
             theta = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(mate.params["script"]))
             found.setdefault(theta, set()).add(np.asarray(mate.params["chances"]).tobytes())
         assert all(len(behaviours) >= 3 for behaviours in found.values())
 
     def test_fewer_tasks_than_minibatches_raise_error(self):
-        groups = make_groups({(LAYOUT, "a"): teammates(1)}, 3, {LAYOUT.name: 1.0})
+        (tasks,) = make_groups({(LAYOUT, "a"): teammates(1)}, 3, {LAYOUT.name: 1.0})
         with pytest.raises(OptionError, match=r"minibatches = 4: expected at most the 3 tasks .* --minibatches"):
-            PlayTrainer(METHOD, OPTIONS, PlayOptions(minibatches=4), groups)
+            PlayTrainer(METHOD, OPTIONS, PlayOptions(minibatches=4), tasks)
 
     def test_mixture_of_behaviours_has_the_declared_shares(self):
         chances = mixed_chances(100)
@@ -285,24 +280,22 @@ class TestPreparation:
         assert {one for cell in added.values() for one in cell["teammates"]} == ids
         seen = read_trained_on(job.about["trained_on"], "here")
         assert seen.layouts == ("cramped_up",) and set(seen.teammates) >= set(added)
-        assert sum(job.about["histories"]["groups"].values()) == job.trainer.tasks
+        assert sum(job.about["histories"]["groups"].values()) == len(job.trainer.tasks)
 
     def test_rearranged_and_four_recipe_layouts_are_added_in_proportion(self):
         """The rearranged versions of a layout have nearly equal numbers of tasks, which differ by at most one."""
         play = PlayOptions(rearranged=6, four_recipes=True)
-        players = self.prepare(play).trainer.players
-        groups = [group for player in players for group in player.groups]
-        assert len(players) == len({group.family for group in groups})
-        assert all(group.hidden and len(group.layouts) == len(group.teammates) for group in groups)
-        tasks = collections.Counter[str]()
-        for group in groups:
-            tasks[group.label] += len(group.teammates)
+        trainer = self.prepare(play).trainer
+        families = {task.family for task in trainer.tasks}
+        assert len(trainer.players) == len(families)
+        assert all(task.hidden for task in trainer.tasks)
+        tasks = collections.Counter(task.label for task in trainer.tasks)
         assert tasks["cramped_up rearranged"] == pytest.approx(REARRANGED_SHARE * tasks["cramped_up"], abs=3)
         assert 0 < tasks["cramped_up four recipes"] < tasks["cramped_up"]
-        rearranged = [group for group in groups if group.label == "cramped_up rearranged"]
-        families = {group.family for group in groups} - {"fcp"}  # fcp teammates can only play their training layout
-        assert {group.family for group in rearranged} == families
-        played = collections.Counter(layout for group in rearranged for layout in group.layouts)
+        rearranged = [task for task in trainer.tasks if task.label == "cramped_up rearranged"]
+        # Teammates of the kind fcp can only play their training layout.
+        assert {task.family for task in rearranged} == families - {"fcp"}
+        played = collections.Counter(task.layout for task in rearranged)
         assert {one.rows for one in played} == {one.rows for one in rearranged_layouts(LAYOUT, 6)}
         assert max(played.values()) - min(played.values()) <= 1
 
@@ -322,8 +315,7 @@ class TestPreparation:
         of_histories = self.prepare(PlayOptions(), (), HistoryOptions((name,), source=("search",)), 256)
         of_tasks = self.prepare(PlayOptions(), tasks, HistoryOptions((name,)), 256)
         for job in (of_histories, of_tasks):
-            groups = [group for player in job.trainer.players for group in player.groups]
-            dishes = {layout.recipes for group in groups for layout in group.layouts}
+            dishes = {task.layout.recipes for task in job.trainer.tasks}
             assert dishes == {task.layout.recipes for task in tasks}
             assert all(len(of_task) == 1 for of_task in dishes)
 

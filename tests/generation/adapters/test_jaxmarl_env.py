@@ -36,8 +36,8 @@ def test_environment_implements_the_base_class_of_jaxmarl():
 
 
 @pytest.mark.slow
-def test_jaxmarl_training_loop_gives_steps_of_our_environment():
-    """Step as JaxMARL's IPPO does: with the log wrapper, `vmap` over environments and `scan` over steps."""
+def test_jaxmarl_training_loop_reproduces_steps_of_our_environment():
+    """Use the loop of JaxMARL's IPPO: the log wrapper, `vmap` over environments and `scan` over steps."""
     env, layout = JaxMARLEnv("cramped_up", max_steps=LENGTH), get_layout("cramped_up")
     logged = LogWrapper(env, replace_info=False)
     keys = jax.random.split(jax.random.PRNGKey(3), N)

@@ -58,7 +58,7 @@ def stop_after(updates: int):
     return report
 
 
-def forbidden(updates, speed):
+def fail_on_update(updates, speed):
     raise AssertionError("expected no further update of the task")
 
 
@@ -98,28 +98,28 @@ def test_resumed_collection_repeats_updates_after_the_last_save(built, job):
     with (partial / METRICS).open("a") as stream:
         stream.write('{"update": 6, "half a li')
     rewards = np.load(partial / "rewards.npy", mmap_mode="r+")
-    rewards[:, 180:] = 77  # the six saved updates have recorded 180 steps, and later values are not valid
+    rewards[:, 180:] = 77  # the saved state covers 180 steps, so the resumed run overwrites later values
     rewards.flush()
     job.run()
     assert not compare_rebuilds(job.folder, artefact(built / "a")).differences
 
 
 def test_collection_killed_after_the_last_update_resumes(built, job, monkeypatch):
-    def kill(*arguments):
+    def interrupt(*arguments):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(collect, "finish_artefact", kill)
+        patch.setattr(collect, "finish_artefact", interrupt)
         with pytest.raises(KeyboardInterrupt):
             job.run()
-    job.run(kill)
+    job.run(interrupt)
     assert not compare_rebuilds(job.folder, artefact(built / "a")).differences
 
 
 def test_collection_killed_before_renaming_its_folder_resumes(built, job):
     shutil.copytree(artefact(built / "a"), partial_folder(job.folder))
     (partial_folder(job.folder) / LEARNER).write_bytes(b"no longer needed")
-    job.run(forbidden)
+    job.run(fail_on_update)
     assert not compare_rebuilds(job.folder, artefact(built / "a")).differences
 
 
@@ -129,11 +129,11 @@ def test_partial_collection_with_other_settings_starts_again(job, tmp_path, monk
     (tmp_path / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 80\nclip = 0.1"))
     firsts = []
 
-    def writer(partial, task, config, first):
+    def record_first_update(partial, task, config, first):
         firsts.append(first)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(collect, "ArtefactWriter", writer)
+    monkeypatch.setattr(collect, "ArtefactWriter", record_first_update)
     for profile in (job.profile, load_profile(str(tmp_path / "other.toml"))):
         with pytest.raises(KeyboardInterrupt):
             replace(job, profile=profile).run()
@@ -143,18 +143,18 @@ def test_partial_collection_with_other_settings_starts_again(job, tmp_path, monk
 def test_collecting_a_finished_task_again_changes_nothing(built, job):
     shutil.copytree(artefact(built / "a"), job.folder)
     before = (job.folder / METADATA).stat().st_mtime_ns
-    job.run(forbidden)
+    job.run(fail_on_update)
     assert (job.folder / METADATA).stat().st_mtime_ns == before
 
 
-# Full disks give a clear error, no SIGBUS, and leave no files behind.
+# A full disk must raise DiskFullError instead of crashing the process with SIGBUS.
 
 
 def test_too_little_free_space_raises_error_before_collection(job, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=5_000))
     message = rf"^{job.folder}: the disk is full: this task needs [\d,]{{6,}} bytes, but only 5,000 are free; .* --out$"
     with pytest.raises(DiskFullError, match=message):
-        job.run(forbidden)
+        job.run(fail_on_update)
     assert not [path for path in tmp_path.iterdir() if not path.name.endswith(".lock")]
 
 
@@ -172,15 +172,15 @@ def test_disk_space_of_arrays_is_allocated_in_advance(job, tmp_path):
 
 def test_failed_allocation_of_arrays_leaves_no_files(job):
     with file_size_limit(64 * 1024), pytest.raises(DiskFullError, match=r": the disk is full: this task needs "):
-        job.run(forbidden)
+        job.run(fail_on_update)
     assert not partial_folder(job.folder).exists()
 
 
 def test_full_disk_during_collection_keeps_the_saved_state(job):
-    def fill(updates, speed):
+    def raise_disk_full(updates, speed):
         if updates == 7:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with pytest.raises(DiskFullError, match=": the disk is full: this task needs "):
-        job.run(fill, save_seconds=0)
+        job.run(raise_disk_full, save_seconds=0)
     assert StateFile(partial_folder(job.folder) / LEARNER).progress == 6

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from icrl4aht_generation.collection import curate
-from icrl4aht_generation.collection.task_folder import HistoryArrays, array_shapes, record_rollout
+from icrl4aht_generation.collection.task_folder import array_shapes, record_rollout
 from icrl4aht_generation.learners.config import PPOConfig, Widths
 from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.rollout import Rollout
@@ -26,9 +26,9 @@ ENVS = 3
 UNTOUCHED = 99  # a value that recorded arrays of these tests never contain
 
 
-def empty_histories(config: PPOConfig) -> HistoryArrays:
+def empty_histories(config: PPOConfig) -> dict[str, np.ndarray]:
     shapes = array_shapes(LAYOUT, config.environments, config.episodes)
-    return HistoryArrays(**{name: np.full(shape, UNTOUCHED, dtype) for name, (shape, dtype) in shapes.items()})
+    return {name: np.full(shape, UNTOUCHED, dtype) for name, (shape, dtype) in shapes.items()}
 
 
 def random_rollout(length: int, rng: np.random.Generator) -> Rollout:
@@ -42,7 +42,7 @@ def random_rollout(length: int, rng: np.random.Generator) -> Rollout:
     return Rollout(**fields, **rest)
 
 
-def record_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
+def record_by_loop(rollouts: list[Rollout], config: PPOConfig) -> dict[str, np.ndarray]:
     """Record the first 100 of each 400 steps, and the state after them, in a loop over steps."""
     kept = empty_histories(config)
     for update, rollout in enumerate(rollouts):
@@ -53,12 +53,12 @@ def record_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
                     continue
                 if clock < 100:
                     row = episode * 100 + clock
-                    kept.state[n, row] = rollout.record[t, n]
-                    kept.actions[n, row] = rollout.actions[t, n, 0]
-                    kept.teammate_actions[n, row] = rollout.actions[t, n, 1]
-                    kept.rewards[n, row] = rollout.reward[t, n]
+                    kept["state"][n, row] = rollout.record[t, n]
+                    kept["actions"][n, row] = rollout.actions[t, n, 0]
+                    kept["teammate_actions"][n, row] = rollout.actions[t, n, 1]
+                    kept["rewards"][n, row] = rollout.reward[t, n]
                 elif clock == 100:
-                    kept.episode_end_state[n, episode] = rollout.record[t, n]
+                    kept["episode_end_state"][n, episode] = rollout.record[t, n]
     return kept
 
 
@@ -71,15 +71,15 @@ def test_recorded_arrays_equal_those_of_a_loop_over_steps(length, updates):
     rollouts = [random_rollout(length, rng) for _ in range(updates)]
     expected = record_by_loop(rollouts, config)
     found = empty_histories(config)
-    for number in (*reversed(range(updates)), *range(updates)):  # roll-outs may be recorded in any order, and again
+    for number in (*reversed(range(updates)), *range(updates)):  # backwards, then once more forwards
         record_rollout(found, number, rollouts[number])
-    for name, array in expected._asdict().items():
+    for name, array in expected.items():
         assert array.size and not (array == UNTOUCHED).any(), name  # every entry was written
-        np.testing.assert_array_equal(getattr(found, name), array, err_msg=name)
-        assert getattr(found, name).dtype == array.dtype
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+        assert found[name].dtype == array.dtype
 
 
-def rewards_of(returns: list[list[int]]) -> np.ndarray:
+def rewards_with_returns(returns: list[list[int]]) -> np.ndarray:
     """Return rewards int8 (N, T) of 5 or -5 that add up to the given episode returns."""
     totals = np.array(returns)[..., None] // 5
     rewards = np.where(np.arange(100) < abs(totals), 5 * np.sign(totals), 0).astype(np.int8)
@@ -87,36 +87,37 @@ def rewards_of(returns: list[list[int]]) -> np.ndarray:
     return rewards.reshape(len(returns), -1)
 
 
-def best_of(returns: list[list[int]], keep: int, least_improvement: float | None = None) -> list[int]:
-    return curate.select_streams([curate.stream_returns(rewards_of(returns))], keep, least_improvement)[0].tolist()
+def best_streams(returns: list[list[int]], keep: int, least_improvement: float | None = None) -> list[int]:
+    found = curate.stream_returns(rewards_with_returns(returns))
+    return curate.select_streams([found], keep, least_improvement)[0].tolist()
 
 
-def score_by_hand(curve: list[int]) -> float:
+def reference_score(curve: list[int]) -> float:
     w = max(5, math.floor(0.1 * len(curve))) if len(curve) >= 10 else len(curve) // 2
     start, end = sum(curve[:w]) / w, sum(curve[-w:]) / w
     return end + (end - start)
 
 
 @pytest.mark.parametrize("episodes", [5, 12, 40, 59, 60, 146])
-def test_best_streams_have_the_highest_end_plus_improvement(episodes):
+def test_streams_are_ranked_by_end_return_plus_improvement(episodes):
     rng = np.random.default_rng(episodes)
     returns = (rng.integers(-20, 80, (30, episodes)) * 5).tolist()  # some returns exceed the range of int8
-    scores = [score_by_hand(curve) for curve in returns]
+    scores = [reference_score(curve) for curve in returns]
     assert len(set(scores)) > 20
     expected = sorted(range(30), key=lambda n: -scores[n])
-    assert best_of(returns, 30) == expected
-    assert best_of(returns, 7) == expected[:7]
+    assert best_streams(returns, 30) == expected
+    assert best_streams(returns, 7) == expected[:7]
 
 
 def test_streams_with_equal_scores_are_ordered_by_number():
-    low, high, also_high = [0] * 10, [0] * 5 + [20] * 5, [10] * 5 + [25] * 5  # with scores 0, 40 and 40
+    low, high, also_high = [0] * 10, [0] * 5 + [20] * 5, [10] * 5 + [25] * 5  # the scores are 0, 40 and 40
     curves = [low, high, low, also_high, high, low]
-    assert best_of(curves, 6) == [1, 3, 4, 0, 2, 5]
-    assert best_of(curves, 2) == [1, 3]
-    assert best_of([low] * 100 + [high] * 100, 200) == [*range(100, 200), *range(100)]
+    assert best_streams(curves, 6) == [1, 3, 4, 0, 2, 5]
+    assert best_streams(curves, 2) == [1, 3]
+    assert best_streams([low] * 100 + [high] * 100, 200) == [*range(100, 200), *range(100)]
 
 
-def learner(*improvements: int) -> np.ndarray:
+def improving(*improvements: int) -> np.ndarray:
     """Return the episode returns (N, 10) of streams that start at 0 and improve by the given amounts."""
     return np.array([[0.0] * 5 + [float(improvement)] * 5 for improvement in improvements])
 
@@ -124,12 +125,12 @@ def learner(*improvements: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("learners", "keep", "expected"),
     [
-        ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 4, [[1, 2], [1, 2]]),
-        ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 3, [[1, 2], [1]]),  # improvement 30 exceeds 25
-        ([learner(10, 20), learner(90, 80, 70, 60)], 3, [[1], [0, 1]]),
-        ([learner(30, 20, 40, 50), learner(0, 5, 4, 0)], 8, [[3, 2, 0, 1], [1]]),
-        ([learner(0), learner(0)], 2, [[], []]),
-        ([learner(9), learner(7), learner(8)], 2, [[0], [], [0]]),
+        ([improving(10, 50, 30, 20), improving(15, 40, 25, 5)], 4, [[1, 2], [1, 2]]),
+        ([improving(10, 50, 30, 20), improving(15, 40, 25, 5)], 3, [[1, 2], [1]]),  # improvement 30 comes before 25
+        ([improving(10, 20), improving(90, 80, 70, 60)], 3, [[1], [0, 1]]),
+        ([improving(30, 20, 40, 50), improving(0, 5, 4, 0)], 8, [[3, 2, 0, 1], [1]]),
+        ([improving(0), improving(0)], 2, [[], []]),
+        ([improving(9), improving(7), improving(8)], 2, [[0], [], [0]]),
     ],
 )
 def test_selected_streams_are_divided_among_learners(learners, keep, expected):
@@ -138,7 +139,7 @@ def test_selected_streams_are_divided_among_learners(learners, keep, expected):
 
 @pytest.fixture(scope="module")
 def labels_and_logits():
-    """Return labels of two streams of two episodes, and logits with the memory reset by episode, by step, or never."""
+    """Return labels of two streams of two episodes, and logits with memory resets at episodes, at steps, or never."""
     widths = Widths(pointwise=(8,), spatial=(8,), dense=32, gru=16, head=16)
     network = ActorCritic(widths)
     rng = np.random.default_rng(3)
@@ -155,7 +156,7 @@ def labels_and_logits():
     params["params"]["encoder"]["LayerNorm_0"]["scale"] += 1
     step = jax.jit(network.apply)
 
-    def logits_with_memory_from(starts) -> np.ndarray:
+    def logits_with_resets_at(starts) -> np.ndarray:
         hidden, rows = network.initial_hidden(2), []
         for t in range(200):
             if t in starts:
@@ -167,20 +168,20 @@ def labels_and_logits():
 
     labels = [curate.relabel(LAYOUT, network, params, stream) for stream in states]
     ways = {"episode": {0, 100}, "step": set(range(200)), "never": {0}}
-    return labels, {name: logits_with_memory_from(starts) for name, starts in ways.items()}
+    return labels, {name: logits_with_resets_at(starts) for name, starts in ways.items()}
 
 
 def test_labels_are_greedy_actions_with_the_memory_of_the_episode(labels_and_logits):
     labels, logits = labels_and_logits
     assert [(label.shape, label.dtype) for label in labels] == [((200,), np.int8)] * 2
     chosen = np.take_along_axis(logits["episode"], np.stack(labels)[..., None].astype(int), axis=-1)[..., 0]
-    # Sums in another order round differently, so any action within rounding of the best one is a correct label.
+    # Another order of summation rounds differently, so an action counts as best if its logit is nearly the largest.
     np.testing.assert_allclose(chosen, logits["episode"].max(axis=-1), rtol=0, atol=1e-4)
     assert len(np.unique(labels)) > 2
 
 
 def test_labels_depend_on_memory_within_an_episode(labels_and_logits):
-    """Labels differ from actions with the memory reset at every step, or carried into the next episode."""
+    """Labels differ from the greedy actions of a policy whose memory is reset at every step, or never."""
     labels, logits = labels_and_logits
     without, across = (logits[way].argmax(axis=-1) for way in ("step", "never"))
     assert (np.stack(labels) != without).mean() > 0.1

@@ -29,14 +29,14 @@ from tests.helpers.tiny import PAIR, artefact, start_python
 
 @pytest.fixture(scope="module")
 def profile(tmp_path_factory) -> Path:
-    """Return a profile with the task of `built` and a second task; its name is part of every artefact."""
+    """Return a profile with two tasks; the first task and the file name are those of the fixture `built`."""
     path = tmp_path_factory.mktemp("pair") / "tiny.toml"
     path.write_text(PAIR)
     return path
 
 
 @pytest.fixture
-def unfinished(profile, built, tmp_path) -> Path:
+def damaged_partial(profile, built, tmp_path) -> Path:
     """Return the folder of a damaged partial artefact of the second task."""
     (name,) = {work.name for work in load_profile(str(profile)).units()} - {artefact(built / "a").name}
     partial = partial_folder(tmp_path / "artefacts" / name)
@@ -45,8 +45,8 @@ def unfinished(profile, built, tmp_path) -> Path:
     return partial
 
 
-def test_task_collected_by_another_process_is_waited_for(built, tmp_path):
-    """A task that another process finishes in the meantime is not collected again."""
+def test_job_waits_for_a_process_that_collects_its_task(built, tmp_path):
+    """The job does not collect the task again if the other process has finished it."""
     profile = load_profile(str(built / "tiny.toml"))
     (work,) = profile.units()
     job = CollectionJob(work, profile, tmp_path)
@@ -58,8 +58,8 @@ def test_task_collected_by_another_process_is_waited_for(built, tmp_path):
     assert (job.folder / METADATA).stat().st_mtime_ns == before
 
 
-def test_rebuild_with_an_unfinished_task_writes_no_release(profile, unfinished, built, tmp_path):
-    shutil.copytree(artefact(built / "a"), unfinished.parent / artefact(built / "a").name)
+def test_rebuild_with_an_unfinished_task_writes_no_release(profile, damaged_partial, built, tmp_path):
+    shutil.copytree(artefact(built / "a"), damaged_partial.parent / artefact(built / "a").name)
     with pytest.raises(FailedJobsError, match="1 of 2 jobs are unfinished"):
         run_cli("generate", "--profile", profile, "--out", tmp_path)
     assert not (tmp_path / "lite").exists()
@@ -89,15 +89,15 @@ def listening_addresses(process: psutil.Process) -> set[str]:
 
 
 @pytest.mark.slow
-def test_ray_workers_collect_bit_equal_tasks(profile, unfinished, built, tmp_path):
-    """A damaged task fails on Ray, and the other task equals the task collected in one process. After a repair, the
-    damaged task is also collected. Meanwhile, no process listens on addresses other than the loopback."""
+def test_ray_workers_collect_bit_equal_tasks(profile, damaged_partial, built, tmp_path):
+    """A damaged task fails on Ray, and the other task equals the task collected in one process. After its
+    damaged files are removed, the task is collected. With Ray, processes listen only on loopback addresses."""
     command = ["-m", "icrl4aht_data", "generate", "--profile", str(profile), "--out", str(tmp_path)]
     addresses: set[str] = set()
     process = start_python(*command, "--executor", "ray", "--workers", "2", "--retries", "1")
     while process.poll() is None:
         addresses |= listening_addresses(psutil.Process(process.pid))
-        time.sleep(0.5)  # listing all connections takes much CPU time
+        time.sleep(0.5)  # pause, since listing all connections takes much CPU time
     output, errors = process.communicate()
     assert process.returncode == 1, output + errors
     assert "1 of 2 jobs are unfinished" in errors
@@ -107,10 +107,10 @@ def test_ray_workers_collect_bit_equal_tasks(profile, unfinished, built, tmp_pat
     assert "in progress" in line["traceback"]
     assert "\x1b" not in line["traceback"]
     own = artefact(built / "a")
-    assert not compare_rebuilds(unfinished.parent / own.name, own).differences
+    assert not compare_rebuilds(damaged_partial.parent / own.name, own).differences
     assert addresses
     assert all(ipaddress.ip_address(address.removeprefix("::ffff:")).is_loopback for address in addresses), addresses
-    shutil.rmtree(unfinished)
+    shutil.rmtree(damaged_partial)
     run_cli("generate", "--profile", profile, "--out", tmp_path)
     assert len(load_icrl4aht(tmp_path / "lite").tasks) == 2
     assert verify_release(tmp_path / "lite").ok

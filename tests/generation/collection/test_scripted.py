@@ -103,7 +103,7 @@ def test_actions_equal_oracle_actions_except_for_noise(arrays):
     expected = 1 - arrays["noise"].reshape(40, 1) * 5 / 6
     assert clean[expected[:, 0] == 1].all()
     assert abs(clean.mean() - expected.mean()) < 4 * np.sqrt((expected * (1 - expected)).sum() / 40 / 4000)
-    noisy = arrays["actions"].reshape(40, 100)[~clean]  # these actions are all random
+    noisy = arrays["actions"].reshape(40, 100)[~clean]  # only random actions can differ from the oracle's
     assert (np.bincount(noisy, minlength=6) > 0.1 * len(noisy)).all()
 
 
@@ -124,14 +124,14 @@ def test_episode_depends_only_on_seed_history_and_episode_number(arrays):
     found = play(7)
     for k in range(2):
         steps = slice(100 * episode[k], 100 * episode[k] + 100)
-        np.testing.assert_array_equal(np.asarray(found.state)[k], arrays["state"][history[k], steps])
-        np.testing.assert_array_equal(np.asarray(found.actions)[k], arrays["actions"][history[k], steps])
+        np.testing.assert_array_equal(np.asarray(found["state"])[k], arrays["state"][history[k], steps])
+        np.testing.assert_array_equal(np.asarray(found["actions"])[k], arrays["actions"][history[k], steps])
     other = play(8)
-    assert not np.array_equal(np.asarray(other.state)[0], np.asarray(found.state)[0])
+    assert not np.array_equal(np.asarray(other["state"])[0], np.asarray(found["state"])[0])
 
 
 def test_noise_schedules_follow_their_settings():
-    """Schedules follow the formula and the ranges; a history's schedule does not depend on the number of histories."""
+    """Noise follows the formula within the given ranges and does not depend on the number of histories."""
     linear = noise_schedules(NoiseConfig(histories=2, episodes=11), 0)
     np.testing.assert_allclose(linear, [np.linspace(1, 0, 11)] * 2, atol=1e-6)
     steep = NoiseConfig(histories=1, episodes=11, begin=(0.2, 0.2), finish=(0.6, 0.6), power=(2, 2), end=(0.1, 0.1))
@@ -151,7 +151,7 @@ def test_noise_schedules_follow_their_settings():
     assert np.ptp(drawn[:, 15]) > 0.5
 
 
-def test_stopped_scripted_task_starts_again_with_equal_result(noise_artefact, profile, tmp_path):
+def test_interrupted_scripted_task_is_collected_again_with_equal_results(noise_artefact, profile, tmp_path):
     job, seen = CollectionJob(WORK, profile, tmp_path), []
 
     def stop(done, speed):
@@ -176,17 +176,17 @@ def test_timing_file_is_not_in_the_hashed_metadata(noise_artefact):
 
 
 def test_full_disk_leaves_no_files_of_a_scripted_task(profile, tmp_path):
-    def fill(pieces, speed):
+    def raise_disk_full(pieces, speed):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     job = CollectionJob(WORK, profile, tmp_path)
     with pytest.raises(DiskFullError, match=r": the disk is full: this task needs "):
-        job.run(fill)
+        job.run(raise_disk_full)
     assert not partial_folder(job.folder).exists()
 
 
 def search_histories(profile: Profile, folder: Path, dish: tuple[int, int, int]) -> dict[str, np.ndarray]:
-    """Return histories of the searching script in a task with one wanted recipe and a teammate that only watches."""
+    """Return histories of the scripted ego that searches for the wanted recipe; the teammate never acts."""
     work = Work(make_task("preference", "train", "asymm_both_plain", WATCHER, 5, [dish]), "search")
     job = CollectionJob(work, profile, folder)
     job.run()
@@ -194,7 +194,7 @@ def search_histories(profile: Profile, folder: Path, dish: tuple[int, int, int])
     return {path.stem: np.load(path) for path in job.folder.glob("*.npy")}
 
 
-def test_searching_script_finds_and_remembers_the_wanted_recipe(profile, tmp_path):
+def test_searching_ego_finds_and_remembers_the_wanted_recipe(profile, tmp_path):
     config = replace(SEARCH, histories=8, episodes=10, start=(0.0, 0.0))
     exact = replace(profile, search=config)
     one, other = (search_histories(exact, tmp_path, dish) for dish in ((0, 0, 0), (1, 1, 1)))
@@ -242,7 +242,7 @@ def test_scripted_histories_can_have_a_learned_teammate(profile, tmp_path):
 
 @pytest.mark.slow
 def test_generate_check_and_verify_commands_accept_scripted_histories(tmp_path):
-    """A release is valid. Collecting it again in new processes, in batches of 256 episodes, gives an equal release."""
+    """Verify a release, and compare it with a release collected in new processes in batches of 256 episodes."""
     (tmp_path / "noise.toml").write_text(NOISE)
     command = ("generate", "--profile", tmp_path / "noise.toml", "--out")
     again = ("--tasks", tmp_path / "a/lite/meta/tasks.jsonl", "--workers", 2)

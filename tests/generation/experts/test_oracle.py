@@ -45,7 +45,7 @@ def layout_params(*names: str) -> list[Any]:
     return [pytest.param(name, marks=[] if name == "asymm_right" else [pytest.mark.slow]) for name in names]
 
 
-def h4(layout: Layout) -> Policy:
+def h4_ego(layout: Layout) -> Policy:
     """Return the heuristic H4 in the ego's slot."""
     return build_teammate(layout, published_teammates(layout.name, "utility_greedy")[0], EGO)
 
@@ -54,7 +54,7 @@ def h4(layout: Layout) -> Policy:
 def episodes(agent: str, layout: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return records uint8 (N, T, S), actions (N, T, 2) and rewards (N, T) of all episodes of a layout."""
     tasks = [t for t in TASKS if t.layout.name == layout and t.teammate_family == FAMILY_ON[layout]]
-    make = h4 if agent == "h4" else AGENTS[agent]
+    make = h4_ego if agent == "h4" else AGENTS[agent]
     played = list(play_tasks(make, tasks, SHORT))
     record, actions, reward = (np.concatenate([np.asarray(p[k]) for p in played]) for k in range(3))
     return record, actions, reward
@@ -92,12 +92,12 @@ def test_oracle_fills_only_one_pot_at_a_time():
     state = unpack(layout, episodes("oracle", "test_wide")[0])
     contents = state.pot_items & (0xFF - COOKED)
     begun = (ingredient_count(contents) > 0) & (ingredient_count(contents) < 3)
-    fits = (_counts(contents) <= _counts(state.recipe)[..., None, :]).all(axis=-1)
+    fits = (ingredient_counts(contents) <= ingredient_counts(state.recipe)[..., None, :]).all(axis=-1)
     assert (begun & fits).any()
     assert (begun & fits).sum(axis=-1).max() == 1
 
 
-def _counts(items: np.ndarray) -> np.ndarray:
+def ingredient_counts(items: np.ndarray) -> np.ndarray:
     return (items[..., None] >> np.array([2, 4, 6]) & 3).astype(int)
 
 

@@ -101,9 +101,9 @@ def test_jobs_in_local_processes_are_retried_and_reported(tmp_path):
 
 @pytest.mark.slow
 def test_quick_jobs_share_worker_processes(tmp_path):
-    """A job with another number of XLA threads, or a job that is not quick, gets a new process."""
+    """A job that is not quick gets a new process."""
     jobs = [FileJob(tmp_path, f"{number}") for number in range(5)]
-    jobs += [FileJob(tmp_path, name, xla_threads=2, is_quick=False) for name in ("long", "longer")]
+    jobs += [FileJob(tmp_path, name, is_quick=False) for name in ("long", "longer")]
     run(jobs, tmp_path, workers=2)
     pids = [(tmp_path / job.name).read_text() for job in jobs]
     assert len({*pids[:5]}) <= 2
@@ -115,7 +115,7 @@ def test_training_stopped_error_can_be_pickled():
     assert (stopped.code, str(stopped)) == (143, "saved")
 
 
-def test_jobs_of_a_rebuild_have_unique_names_and_numbers_of_updates(tmp_path):
+def test_jobs_of_a_rebuild_have_unique_names_and_positive_numbers_of_updates(tmp_path):
     profile = load_profile("smoke")
     populations = population_runs(profile, {"demo_wide": ["fcp"]}, 0)
     jobs = [CollectionJob(work, profile, tmp_path) for work in profile.units()]

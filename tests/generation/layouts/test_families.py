@@ -1,4 +1,4 @@
-"""Test generated layouts: family, seed and number determine them, and no two are symmetric or in two splits."""
+"""Test generated layouts: family, seed and number determine a layout, and all layouts are distinct up to symmetry."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_generated_layouts_have_allowed_fixtures_and_recipes(family, samples):
     assert len(shown) == 8, "with and without recipe indicators, buttons and the delivery indicator"
 
 
-def test_layouts_of_family_rooms_are_small_and_a_third_separates_agents(samples):
+def test_family_rooms_has_small_layouts_and_separates_agents_in_every_third(samples):
     published = published_rooms(False) | published_rooms(True)
     assert len(published) == 7  # some layouts, such as coord_simple and test_simple, have the same floor cells
     for layout in samples["rooms"]:
@@ -128,7 +128,7 @@ def test_generated_layouts_are_split_by_declared_shares(samples):
 
 
 def test_layouts_with_rooms_of_test_layouts_are_not_for_training(samples):
-    """Floor shapes of test layouts are excluded, except those that a training layout of the track layout has too."""
+    """Rooms of test layouts are excluded from training, except rooms that training layouts of track `layout` have."""
     assert {name for name in LAYOUT_NAMES if not has_tested_rooms(get_layout(name))} == {
         *TRACKS["layout"]["train"],
         *TRACKS["layout"]["test"],
@@ -153,7 +153,7 @@ def test_invalid_arguments_of_layout_generation_raise_errors():
             find_generated(name)
 
 
-def test_too_few_layouts_of_a_family_raise_error_with_their_number(monkeypatch):
+def test_request_for_too_many_layouts_raises_error_with_the_number_found(monkeypatch):
     few = generate_layouts("rooms", 0, 3)
     draws = [(one.rows, one.recipes, False) for one in few]
     monkeypatch.setattr(families, "MOST_REPEATS", 20)

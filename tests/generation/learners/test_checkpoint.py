@@ -24,7 +24,7 @@ def policy():
 
 
 def flat_kernel(folder) -> str:
-    """Return the name of the only matrix that is stored by its nonzero rows."""
+    """Return the name of the only weight matrix that is stored without its zero rows."""
     (name,) = (name for name in load_file(folder / POLICY_WEIGHTS) if name.endswith("@rows"))
     return name.removesuffix("@rows")
 

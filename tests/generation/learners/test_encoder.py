@@ -30,13 +30,13 @@ def encoder(kind, view: CompactView | None = None) -> WindowEncoder:
 
 
 def with_gradient(module: WindowEncoder) -> Any:
-    """Return a function that computes the gradient of a weighted sum of the features, and the features."""
+    """Return a function that computes the gradient of the features' weighted sum, and the features themselves."""
 
-    def total(params, seen):
+    def weighted_sum(params, seen):
         features: Any = module.apply(params, seen)
         return jnp.vdot(features, jnp.arange(features.size, dtype=features.dtype).reshape(features.shape)), features
 
-    return jax.jit(jax.grad(total, has_aux=True))
+    return jax.jit(jax.grad(weighted_sum, has_aux=True))
 
 
 @pytest.mark.parametrize("kind", ["words", pytest.param("mlp", marks=pytest.mark.slow)])
@@ -53,7 +53,7 @@ def test_compact_inputs_give_the_features_and_gradients_of_observations(kind):
         params = jax.tree.map(lambda values: values.astype(jnp.float64), params)
         expected_gradient, expected = with_gradient(plain)(params, obs)
         gradient, features = with_gradient(compact)(params, seen)
-        again: Any = jax.jit(compact.apply)(params, obs)  # observations are accepted too
+        again: Any = jax.jit(compact.apply)(params, obs)  # the encoder also accepts observations
     assert features.shape == (3, 20, 12) and features.dtype == jnp.float64
     found, wanted = (
         jax.tree.leaves((features, gradient, again)),
@@ -63,8 +63,8 @@ def test_compact_inputs_give_the_features_and_gradients_of_observations(kind):
         np.testing.assert_allclose(one, other, rtol=0, atol=TOLERANCE * np.abs(other).max())
 
 
-def test_only_entries_of_the_layout_have_nonzero_initial_weights():
-    """Entries that are constant on a layout start with zero weights, so they add nothing on other layouts."""
+def test_only_entries_that_can_differ_from_0_have_nonzero_initial_weights():
+    """Observation entries that are always 0 on a layout have no effect on other layouts before training."""
     obs, view = jnp.asarray(observe(LAYOUT, RECORDS, 0)), CompactView("mlp", (LAYOUT,))
     kernels = {}
     for name, module, seen in (

@@ -87,11 +87,11 @@ def case() -> Case:
     reset = np.zeros((STEPS, ENVS), bool)
     reset[0, 0] = reset[2, 1] = reset[3, 1] = True
 
-    def random(weight) -> jax.Array:
+    def random_weight(weight) -> jax.Array:
         fan_in = np.prod(weight.shape[:-1]) if len(weight.shape) > 1 else 16
         return jnp.asarray(rng.normal(size=weight.shape) * (2 / fan_in) ** 0.5, jnp.float32)
 
-    params = jax.tree.map(random, jax.eval_shape(network.init, jax.random.key(0), hidden, obs, reset))
+    params = jax.tree.map(random_weight, jax.eval_shape(network.init, jax.random.key(0), hidden, obs, reset))
     return Case(network, params, hidden, obs, jnp.asarray(reset))
 
 
@@ -113,14 +113,14 @@ def test_outputs_and_gradients_equal_those_of_the_reference_network(case):
     weights = jax.random.normal(jax.random.key(4), (STEPS, ENVS, 7))
 
     def with_gradients(network):
-        """Return a function that computes the gradients of a weighted sum of all outputs, and the outputs."""
+        """Return a function that computes the gradients of the weighted sum of all outputs, and these outputs."""
 
-        def total(params, hidden):
+        def weighted_sum(params, hidden):
             outputs = network.apply(params, hidden, case.obs, case.reset)
             last, logits, values = outputs
             return jnp.sum(weights[..., :6] * logits) + jnp.sum(weights[..., 6] * values) + jnp.sum(last), outputs
 
-        return jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))
+        return jax.jit(jax.grad(weighted_sum, argnums=(0, 1), has_aux=True))
 
     (gradient, to_hidden), outputs = with_gradients(case.network)(case.params, case.hidden)
     (plain_gradient, plain_to_hidden), plain_outputs = with_gradients(plain)(names, case.hidden)

@@ -20,7 +20,7 @@ from tests.helpers.populations import CONFIG, paper_multipliers, population
 from tests.helpers.trees import same_bytes
 
 
-def part(tree: Any, number: int) -> Any:
+def select(tree: Any, number: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[number], tree)
 
 
@@ -30,7 +30,7 @@ def learn(lbrdiv):
     return jax.jit(lbrdiv.population.ppo.learn)
 
 
-class Updated(NamedTuple):
+class UpdateResult(NamedTuple):
     """An update of a population, with the states before and after.
 
     Attributes:
@@ -52,7 +52,7 @@ class Updated(NamedTuple):
     rollout: Rollout
 
 
-def second_update(algorithm: Algorithm) -> Updated:
+def second_update(algorithm: Algorithm) -> UpdateResult:
     """Return the second update of a population, in which the learning rate's warm-up is over."""
     trained = population(algorithm)
 
@@ -60,31 +60,31 @@ def second_update(algorithm: Algorithm) -> Updated:
     def update(state: PopulationState):
         rollouts = []
 
-        def recorded(*arguments):
+        def recording_roll_out(*arguments):
             rollouts.append(roll_out(*arguments))
             return rollouts[-1]
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(population_module, "roll_out", recorded)
+            patch.setattr(population_module, "roll_out", recording_roll_out)
             return *trained.update(state), *rollouts[0]
 
     before = update(jax.jit(trained.init)(jax.random.key(5)))[0]
     after, metrics, carry, rollout = update(before)
-    return Updated(trained, update, before, after, {n: float(v) for n, v in metrics.items()}, carry, rollout)
+    return UpdateResult(trained, update, before, after, {n: float(v) for n, v in metrics.items()}, carry, rollout)
 
 
 @pytest.fixture(scope="module")
-def comedi() -> Updated:
+def comedi() -> UpdateResult:
     return second_update(CoMeDi())
 
 
 @pytest.fixture(scope="module")
-def lbrdiv() -> Updated:
+def lbrdiv() -> UpdateResult:
     return second_update(LBRDiv(2))
 
 
 @pytest.fixture(params=[pytest.param("comedi", marks=pytest.mark.slow), "lbrdiv"])
-def updated(request) -> Updated:
+def updated(request) -> UpdateResult:
     return request.getfixturevalue(request.param)
 
 
@@ -99,7 +99,7 @@ def test_population_update_depends_only_on_the_state(updated):
 def test_population_update_changes_learning_policies_only(updated):
     learning = updated.population.assignment.learning
     for number in range(updated.population.assignment.policies):
-        same = same_bytes(part(updated.before.params, number), part(updated.after.params, number))
+        same = same_bytes(select(updated.before.params, number), select(updated.after.params, number))
         assert same == (number >= learning)
 
 
@@ -137,8 +137,8 @@ def test_population_update_equals_separate_updates_of_each_policy(lbrdiv, learn)
             weight=jnp.asarray(weight[slots])[None],
             partner=jnp.asarray(assignment.policy[1 - slots[0] // assignment.envs, slots % assignment.envs])[None],
         )
-        expected = learn(part(before.params, number), part(before.optimizer, number), played, keys[number])[0]
-        for a, b in zip(jax.tree.leaves(part(lbrdiv.after.params, number)), jax.tree.leaves(expected), strict=True):
+        expected = learn(select(before.params, number), select(before.optimizer, number), played, keys[number])[0]
+        for a, b in zip(jax.tree.leaves(select(lbrdiv.after.params, number)), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=5e-5)
 
 

@@ -20,7 +20,7 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from tests.helpers.populations import paper_multipliers, population
 
 
-def test_fcp_members_play_both_agents_with_themselves():
+def test_each_fcp_member_plays_both_agents():
     assignment = FCP(3).assignment(4)
     np.testing.assert_array_equal(assignment.policy, [[0] * 4 + [1] * 4 + [2] * 4] * 2)
     np.testing.assert_array_equal(assignment.term, assignment.policy)
@@ -54,7 +54,7 @@ def test_confederates_play_teammates_and_best_responses_play_egos(algorithm, mem
 
 
 @pytest.mark.parametrize(("members", "environments"), [(2, 8), (3, 8), (4, 24), (10, 256)])
-def test_brdiv_uses_three_quarters_self_play_and_every_other_pair(members, environments):
+def test_brdiv_has_three_quarters_self_play_and_all_cross_play_pairs(members, environments):
     responses, confederates = BRDiv(members).assignment(environments).policy
     pairs = np.zeros((members, members), int)
     np.add.at(pairs, (confederates, responses - members), 1)
@@ -91,7 +91,7 @@ def test_comedi_divides_environments_into_four_equal_kinds_of_play(environments)
     assert assignment.agent_slots(0)[1].size + assignment.agent_slots(1)[1].size == 2 * quarter + quarter + quarter // 2
 
 
-def test_comedi_rejects_environments_that_are_not_a_multiple_of_eight():
+def test_comedi_rejects_a_number_of_environments_that_is_not_a_multiple_of_eight():
     with pytest.raises(ValueError, match="environments = 12: expected a multiple of 8 for CoMeDi"):
         CoMeDi().assignment(12)
 
@@ -131,7 +131,7 @@ def weights_by_paper(algorithm: Any, memory: Any) -> np.ndarray:
         elif isinstance(algorithm, CoMeDi):
             quarter = env // 4
             alpha, beta = algorithm.cross_play_weight, algorithm.mixed_play_weight
-            mixed = beta / 2 / 4 if left == right else beta / 2 / 2  # J_MP: 4 slots and 2 slots
+            mixed = beta / 2 / 4 if left == right else beta / 2 / 2  # the terms of J_MP average 4 and 2 slots
             both = {0: 1 / 8, 1: -alpha / 4, 2: 0, 3: mixed}[quarter]
             expected[:, env] = [both * (left == 0), both * (right == 0)]
         else:
@@ -147,7 +147,7 @@ def weights_by_paper(algorithm: Any, memory: Any) -> np.ndarray:
     return expected
 
 
-def some_multipliers(members: int) -> Multipliers:
+def random_multipliers(members: int) -> Multipliers:
     rng = np.random.default_rng(members)
     vertical, horizontal, returns = rng.uniform(0, 2, (3, members, members)).astype(np.float32)
     np.fill_diagonal(vertical, 0.5)
@@ -161,14 +161,14 @@ def some_multipliers(members: int) -> Multipliers:
         (FCP(3), ()),
         (BRDiv(3), ()),
         (BRDiv(2, cross_play_weight=0.25), ()),
-        (LBRDiv(3), some_multipliers(3)),
+        (LBRDiv(3), random_multipliers(3)),
         (LBRDiv(4), LBRDiv(4).init()),
         (CoMeDi(), ()),
         (CoMeDi(cross_play_weight=0.3, mixed_play_weight=2.0), ()),
     ],
 )
 def test_slot_weights_follow_the_equations_of_the_paper(algorithm, memory):
-    """Weights agree up to a factor for each policy, which makes the mean absolute weight of a policy 1."""
+    """Each policy's weights are those of the paper, divided by their mean absolute value."""
     trained = population(algorithm)
     found = np.asarray(trained._slot_weights(memory))
     expected, policy, counts = (
@@ -194,7 +194,7 @@ def random_returns(k: int, rng: np.random.Generator, share: float) -> tuple[np.n
 
 
 def test_lbrdiv_multipliers_follow_the_update_of_the_paper():
-    """Compare several updates from the initial multipliers, with different shares of pairs seen."""
+    """Compare a sequence of updates that see different shares of the pairs."""
     k, rng = 4, np.random.default_rng(12)
     algorithm = LBRDiv(k, tolerance=0.3, learning_rate=0.05)
     found, expected = algorithm.init(), algorithm.init()

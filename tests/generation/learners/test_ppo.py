@@ -1,8 +1,8 @@
 """Test PPO: advantages, loss, replay of the recurrent state, schedules, and learning.
 
 All tests use one tiny learner. Its ego stands between two buttons, a pile and a pot, so it often presses a button
-(reward -5) or fills the pot (shaped reward 3). Roll-outs have 8 steps and episodes 12, so of three roll-outs, one
-episode ends inside the second and one at the end of the third.
+(reward -5) or fills the pot (shaped reward 3). Roll-outs have 8 steps and episodes have 12, so
+one episode ends inside the second roll-out, and one at the end of the third.
 """
 
 from __future__ import annotations
@@ -81,48 +81,48 @@ def update(learner) -> UpdateFunction:
 
 
 @pytest.fixture(scope="module")
-def untrained(learner) -> LearnerState:
+def initial_state(learner) -> LearnerState:
     return jax.jit(learner.init)(jax.random.key(3))
 
 
 @pytest.fixture(scope="module")
-def frozen(untrained) -> LearnerState:
+def frozen_state(initial_state) -> LearnerState:
     """Return a state at the end of the learning-rate schedule, where updates change no parameters. Random parameters
     make logits and values vary with the hidden state."""
     rng = np.random.default_rng(0)
-    params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.3, untrained.params)
+    params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.3, initial_state.params)
     steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
     optimizer = jax.tree.map(
-        lambda x: jnp.full_like(x, steps) if jnp.issubdtype(x.dtype, jnp.integer) else x, untrained.optimizer
+        lambda x: jnp.full_like(x, steps) if jnp.issubdtype(x.dtype, jnp.integer) else x, initial_state.optimizer
     )
-    return untrained._replace(params=params, optimizer=optimizer)
+    return initial_state._replace(params=params, optimizer=optimizer)
 
 
-class Played(NamedTuple):
+class UpdateSequence(NamedTuple):
     before: list[LearnerState]
     rollouts: list[Rollout]  # the leaves are NumPy arrays
     metrics: list[dict[str, float]]
 
 
-def play(update: UpdateFunction, state: LearnerState, updates: int) -> Played:
+def run_updates(update: UpdateFunction, state: LearnerState, updates: int) -> UpdateSequence:
     before, rollouts, metrics = [], [], []
     for _ in range(updates):
         before.append(state)
         state, rollout, values = update(state)
         rollouts.append(jax.tree.map(np.asarray, rollout))
         metrics.append({name: float(value) for name, value in values.items()})
-    return Played(before, rollouts, metrics)
+    return UpdateSequence(before, rollouts, metrics)
 
 
 @pytest.fixture(scope="module")
-def played(update, frozen) -> Played:
-    """Return 40 updates from the state `frozen`, in which the policy never changes."""
-    return play(update, frozen, 40)
+def played(update, frozen_state) -> UpdateSequence:
+    """Return 40 updates from the fixture `frozen_state`, in which the policy never changes."""
+    return run_updates(update, frozen_state, 40)
 
 
 @pytest.fixture(scope="module")
-def trained(update, untrained) -> Played:
-    return play(update, untrained, CONFIG.updates)
+def trained(update, initial_state) -> UpdateSequence:
+    return run_updates(update, initial_state, CONFIG.updates)
 
 
 def ego_choices(rollout: Rollout) -> Choice:
@@ -182,7 +182,7 @@ def test_training_sequences_replay_a_roll_out_across_episodes(learner, played):
     log_prob, value = replay(learner, state, rollout, rollout.reset)
     np.testing.assert_allclose(log_prob, ego_choices(rollout).log_prob, rtol=0, atol=1e-4)
     np.testing.assert_allclose(value, ego_choices(rollout).value, rtol=0, atol=1e-4)
-    # With resets at the last step of an episode instead of the first step, values are wrong from this step on.
+    # If the memory is reset one step too early, at the last step of an episode, values are wrong from this step on.
     _, value = replay(learner, state, rollout, rollout.done)
     wrong = np.abs(value - ego_choices(rollout).value).max(axis=1)
     assert wrong[:3].max() < 1e-4 < 1e-2 < wrong[3:].min()
@@ -195,7 +195,7 @@ def test_ppo_loss_equals_formulas_in_numpy(learner, played):
     params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.1, played.before[1].params)
     hidden = played.before[1].carry.memories[EGO]
     advantage, target = rng.normal(size=(2, *rollout.done.shape)).astype(np.float32)
-    weight = np.array([1.0, -1.0, 0.5, -2.0], np.float32)  # negative weights lower returns
+    weight = np.array([1.0, -1.0, 0.5, -2.0], np.float32)  # a negative weight trains for lower returns
     own = ego_sequences(played.before[1], rollout)._replace(weight=weight[None])
     batch = jax.tree.map(jnp.asarray, Batch(own, advantage, target))
     total, parts = jax.jit(learner.ppo.loss)(params, batch)
@@ -220,9 +220,9 @@ def test_ppo_loss_equals_formulas_in_numpy(learner, played):
     np.testing.assert_allclose(total, policy + 0.5 * value_loss - 0.01 * entropy, rtol=1e-4, atol=1e-5)
 
 
-def test_teammate_actions_depend_on_the_parameters_in_the_state(update, frozen, played):
+def test_teammate_actions_depend_on_the_parameters_in_the_state(update, frozen_state, played):
     """The same compiled update can train with every teammate of a family."""
-    state, rollout, _ = update(frozen._replace(teammate={"turn": jnp.uint32(1)}))
+    state, rollout, _ = update(frozen_state._replace(teammate={"turn": jnp.uint32(1)}))
     first = played.rollouts[0].actions[0, :, TEAMMATE]
     np.testing.assert_array_equal(rollout.actions[0, :, TEAMMATE], (first + 1) % 4)
     assert int(state.teammate["turn"]) == 1
@@ -234,17 +234,17 @@ def test_shaping_weight_falls_linearly_to_zero(played):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
-def test_learning_rate_rises_linearly_then_falls_by_a_cosine():
-    """The rate is measured by Adam's steps: with a constant gradient g, a step is rate * g / (g + eps)."""
+def test_learning_rate_rises_linearly_then_falls_along_a_cosine():
+    """The rate is computed from Adam's steps: with a constant gradient g, a step is rate * g / (g + eps)."""
     steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
     warm = steps // 10
     gradient = jnp.float32(1e-3)
 
-    def one(state, _):
+    def adam_step(state, _):
         change, state = ppo_optimizer(CONFIG).update(gradient, state)
         return state, change
 
-    changes = jax.lax.scan(one, ppo_optimizer(CONFIG).init(gradient), length=steps + 1)[1]
+    changes = jax.lax.scan(adam_step, ppo_optimizer(CONFIG).init(gradient), length=steps + 1)[1]
     rates = -np.asarray(changes, np.float64) * (1e-3 + 1e-5) / 1e-3
     t = np.arange(steps + 1)
     expected = np.where(t < warm, t / warm, 0.5 * (1 + np.cos(np.pi * (t - warm) / (steps - warm))))

@@ -91,7 +91,7 @@ def test_changing_xla_threads_after_jax_was_used_raises_error(monkeypatch):
 
 @pytest.mark.slow
 def test_xla_threads_are_limited_if_jax_was_not_used_yet():
-    """The number of threads that XLA starts equals the limit, as the process's list of threads shows."""
+    """Count the threads that XLA starts in a new process."""
     script = (
         "import os, jax; from icrl4aht_generation.learners.resume import limit_xla_threads, xla_threads\n"
         "limit_xla_threads({0}); jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((500, 500))))\n"
@@ -103,7 +103,7 @@ def test_xla_threads_are_limited_if_jax_was_not_used_yet():
 
 
 class TestStateFile:
-    def test_state_of_another_number_of_threads_raises_error(self, file, monkeypatch):
+    def test_state_saved_with_another_number_of_threads_raises_error(self, file, monkeypatch):
         StateFile(file.path, SETTINGS | software_versions()).save({}, 1)
         monkeypatch.setenv("PJRT_NPROC", "17")
         again = StateFile(file.path, SETTINGS | software_versions())
@@ -145,11 +145,11 @@ class TestStateFile:
     def test_interrupted_save_keeps_the_previous_state(self, file, monkeypatch):
         file.save(state(), 1)
 
-        def cut(path, content):
+        def write_half(path, content):
             path.write_text("half")
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(Path, "write_bytes", cut)
+        monkeypatch.setattr(Path, "write_bytes", write_half)
         with pytest.raises(KeyboardInterrupt):
             file.save(state(), 2)
         assert file.progress == 1
@@ -168,7 +168,7 @@ class TestStateFile:
         with pytest.raises(OptionError, match=rf"s\.safetensors: not a state of this training: {message}; remove"):
             file.load(like)
 
-    def test_state_of_other_settings_raises_error_with_the_difference(self, file):
+    def test_state_saved_with_other_settings_raises_error_with_the_difference(self, file):
         file.save({}, 1)
         other = StateFile(file.path, {"ego": {"rate": 0.2, "layers": [1, 2]}, "seed": 3})
         with pytest.raises(OtherSettingsError, match=r"s\.safetensors: .*ego\.rate was 0\.1, now it is 0\.2"):
@@ -216,7 +216,7 @@ def test_resumed_log_drops_lines_after_the_saved_state(tmp_path):
     assert [json.loads(line)["update"] for line in timing] == [0, 1]
 
 
-def test_states_are_saved_after_seconds_or_updates_and_at_the_end(monkeypatch):
+def test_states_are_saved_at_intervals_of_seconds_or_updates_and_at_the_end(monkeypatch):
     clock = iter([0.0, 1.0, 2.0, 4.0, 4.5, 5.0])
     monkeypatch.setattr(resume.time, "monotonic", lambda: next(clock))
     interval = SaveInterval(5, seconds=2.0)
@@ -226,7 +226,7 @@ def test_states_are_saved_after_seconds_or_updates_and_at_the_end(monkeypatch):
     assert [update for update in range(1, 8) if interval.due(update)] == [3, 6, 7]
 
 
-def test_locked_run_folder_raises_error_for_a_second_user(tmp_path):
+def test_locking_a_run_folder_twice_raises_error(tmp_path):
     with run_lock(tmp_path / "run"):
         with pytest.raises(BusyError, match="run: another process works in this folder"), run_lock(tmp_path / "run"):
             pass

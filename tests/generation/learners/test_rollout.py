@@ -49,7 +49,7 @@ class ScriptMemory(NamedTuple):
     steps: jax.Array  # (M,), number of steps in the episode
 
 
-def scripted(slots: np.ndarray) -> Player:
+def scripted_player(slots: np.ndarray) -> Player:
     """Return a player whose actions depend on the slot, the step and the record at the start of the episode."""
 
     def begin(state: EnvState) -> ScriptMemory:
@@ -77,31 +77,31 @@ def swap_positions(state: EnvState, done: jax.Array) -> EnvState:
     return state._replace(record=jnp.where(done[:, None], first, state.record))
 
 
-class Played(NamedTuple):
+class JoinedRollouts(NamedTuple):
     start: RolloutCarry
     carry: RolloutCarry  # state after the last step
     rollout: Rollout  # steps of both roll-outs
 
 
-PLAYERS = [scripted(slots) for slots in SLOTS]
+PLAYERS = [scripted_player(slots) for slots in SLOTS]
 scripted_rollout = jax.jit(lambda carry, key: roll_out(ENV, PLAYERS, carry, STEPS, key))
 
 
-def play(run: Any) -> Played:
+def play(run: Any) -> JoinedRollouts:
     """Return two successive roll-outs joined into one, as NumPy arrays."""
     start = init_rollout(ENV, PLAYERS, jax.random.split(jax.random.key(0), ENVS))
     middle, one = run(start, jax.random.key(1))
     carry, other = run(middle, jax.random.key(2))
-    return Played(start, carry, jax.tree.map(lambda *parts: np.concatenate(parts), one, other))
+    return JoinedRollouts(start, carry, jax.tree.map(lambda *parts: np.concatenate(parts), one, other))
 
 
 @pytest.fixture(scope="module")
-def played() -> Played:
+def played() -> JoinedRollouts:
     return play(scripted_rollout)
 
 
 @pytest.fixture(scope="module")
-def played_with_hook() -> Played:
+def played_with_hook() -> JoinedRollouts:
     return play(jax.jit(lambda carry, key: roll_out(ENV, PLAYERS, carry, STEPS, key, swap_positions)))
 
 
@@ -125,7 +125,7 @@ def apply():
 
 
 def env_state(record: np.ndarray) -> EnvState:
-    """Return the states of environments with the given records after the first step of their first episode."""
+    """Return states of environments that have the given records and took one step of their first episode."""
     clock = jnp.ones(len(record), jnp.int32)
     return EnvState(jax.random.split(jax.random.key(0), len(record)), 0 * clock, clock, jnp.asarray(record))
 
@@ -156,7 +156,7 @@ def test_roll_out_equals_single_steps_of_the_environment(played):
 
 
 @pytest.mark.parametrize("batch", [(), (3,)])
-def test_slot_records_show_each_agent_its_observation(batch):
+def test_slot_records_give_each_agent_its_own_observation(batch):
     slots = np.array([7, 0, 3, 4, 5, 4])
     rng = np.random.default_rng(8)
     record = random_records(LAYOUT, 12, rng).reshape(3, ENVS, -1)[(0,) if batch == () else slice(None)]
@@ -172,7 +172,7 @@ def test_slot_records_show_each_agent_its_observation(batch):
 
 
 def test_players_restart_only_in_environments_whose_episode_ended():
-    """The third environment starts two steps later in its episode than the others."""
+    """The third environment starts at step 2 of its episode, and the others start at step 0."""
     clock = np.array([0, 0, 2, 0])
     start = init_rollout(ENV, PLAYERS, jax.random.split(jax.random.key(0), ENVS))
     start = start._replace(env=start.env._replace(clock=jnp.asarray(clock)))
@@ -185,11 +185,11 @@ def test_players_restart_only_in_environments_whose_episode_ended():
 def test_returns_add_up_rewards_of_an_episode_across_roll_outs(played):
     """The environment's rewards are replaced by synthetic ones, since scripted play earns few rewards."""
 
-    class Paying(Environment):
+    class SyntheticRewards(Environment):
         def step(self, state, actions):
             return super().step(state, actions)._replace(reward=(actions.sum(axis=1) + state.clock).astype(jnp.float32))
 
-    run = jax.jit(lambda carry, key: roll_out(Paying(LAYOUT, EPISODE), PLAYERS, carry, STEPS, key))
+    run = jax.jit(lambda carry, key: roll_out(SyntheticRewards(LAYOUT, EPISODE), PLAYERS, carry, STEPS, key))
     middle, first = run(played.start, jax.random.key(1))
     after, second = run(middle, jax.random.key(2))
     reward, returns = (
@@ -203,7 +203,8 @@ def test_returns_add_up_rewards_of_an_episode_across_roll_outs(played):
 
 def test_restart_hook_changes_only_first_states_of_episodes(played, played_with_hook):
     first, rollout = played.rollout.record, played_with_hook.rollout
-    np.testing.assert_array_equal(rollout.record[:EPISODE], first[:EPISODE])  # no hook call at the first start
+    # The hook is not called before the first episode.
+    np.testing.assert_array_equal(rollout.record[:EPISODE], first[:EPISODE])
     for start in (5, 10, 15):
         swapped_positions = first[start].copy()
         swapped_positions[:, :2] = first[start, :, 1::-1]
@@ -261,10 +262,10 @@ def test_player_of_several_policies_equals_separate_players(params):
 def test_policy_player_can_have_parameters_for_each_environment():
     """Actions depend on the policy's parameters and on the episode's key, which differs between environments."""
 
-    def draws(params, key):
+    def begin(params, key):
         return jax.random.key_data(key)[1] % 5
 
-    policy = Policy({}, draws, lambda params, memory, view, key: ((params["action"] + memory) % 6, memory), "state")
+    policy = Policy({}, begin, lambda params, memory, view, key: ((params["action"] + memory) % 6, memory), "state")
     own = policy_player(ENV, policy, {"action": jnp.arange(ENVS)}, TEAMMATE, ENVS, own_params=True)
     common = policy_player(ENV, policy, {"action": jnp.int32(3)}, EGO, ENVS)
     np.testing.assert_array_equal(own.agent_slots, np.arange(ENVS, 2 * ENVS))

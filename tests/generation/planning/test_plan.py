@@ -22,10 +22,10 @@ def fixed_speeds(monkeypatch) -> None:
 
 
 def test_cost_of_profile_paper_matches_numbers_of_the_paper(fixed_speeds):
-    """The paper has 8 layouts with 80 teammates each, from populations of 10 members with 256 environments each.
+    """The paper uses 8 layouts with 80 teammates each, and populations of 10 members with 256 environments each.
 
-    A history has T = 146 x 100 = 14,600 steps (paper, App. D.1): in 228 updates, or 58,368 steps, the 146th episode
-    reaches its first 100 steps and the state after them.
+    A history has the first 100 steps of 146 episodes of 400 steps, T = 14,600 (paper, App. D.1). Training takes 228
+    updates, or 58,368 steps, and the 146th episode starts at step 58,000.
     """
     found = plan.estimate_cost(load_profile("paper"), devices=16)
     steps = 228 * 262_144
@@ -42,7 +42,7 @@ def test_cost_of_profile_paper_matches_numbers_of_the_paper(fixed_speeds):
     assert found["full_bytes"] == pytest.approx(9.23 * found["kept_transitions"])
 
 
-def test_cost_of_noise_histories_needs_no_learners(tmp_path):
+def test_cost_of_noise_histories_includes_no_learners(tmp_path):
     (tmp_path / "noise.toml").write_text(NOISE)
     profile = load_profile(str(tmp_path / "noise.toml"))
     found = plan.estimate_cost(profile, devices=2)
@@ -61,7 +61,8 @@ def test_cost_of_noise_histories_needs_no_learners(tmp_path):
 def test_estimated_sizes_match_the_bundled_release():
     dataset = load_icrl4aht()
     shards = sum(path.stat().st_size for path in (dataset.root / "data").rglob("*.h5"))
-    made = [entry for entry in dataset.entries if entry.source != "agent"]  # few histories have source agent
+    # Source agent is left out, since it has few histories.
+    made = [entry for entry in dataset.entries if entry.source != "agent"]
     expected = sum(
         entry.T * plan.BYTES_PER_STEP["lite", str(entry.source)] + plan.BYTES_PER_HISTORY.get(str(entry.source), 0)
         for entry in made

@@ -87,7 +87,7 @@ def test_only_identical_policies_have_distance_0(actions):
 
 @pytest.mark.slow
 def test_actions_on_common_states_use_teammate_observations_and_memory(monkeypatch):
-    """Compare with expected actions: memory starts with each episode, and observations are the teammate's."""
+    """Memory is reset at each episode, and policies that see observations receive the teammate's observation."""
     records = random_records(LAYOUT, 3 * STEPS, np.random.default_rng(0)).reshape(STEPS, 3, -1)
     monkeypatch.setattr(build, "_visited_records", lambda env, numbers, family, key: records)
     found = actions_on_common_states(LAYOUT, [policy(2), policy(1, act_by_state)], steps=STEPS)

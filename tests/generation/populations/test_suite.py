@@ -59,7 +59,7 @@ import numpy as np
 from tests.generation.populations import test_suite
 from flax.traverse_util import flatten_dict
 
-(population,) = test_suite.run_of("fcp").stages
+(population,) = test_suite.smoke_run("fcp").stages
 state = jax.jit(population.init)(jax.random.fold_in(jax.random.key(0), 0))
 update = jax.jit(population.update)
 state, _ = update(state)
@@ -71,12 +71,12 @@ np.savez(sys.argv[1], **flatten_dict(jax.tree.map(np.asarray, state.params), sep
 
 
 @cache
-def run_of(algorithm: str) -> PopulationRun:
+def smoke_run(algorithm: str) -> PopulationRun:
     return PopulationRun(LAYOUT, algorithm, SMOKE.members, CONFIG, seed=0)
 
 
-def job_of(algorithm: str, suite: Path) -> PopulationJob:
-    return PopulationJob(run_of(algorithm), suite)
+def population_job(algorithm: str, suite: Path) -> PopulationJob:
+    return PopulationJob(smoke_run(algorithm), suite)
 
 
 short_cross_play = partial(cross_play.cross_play_returns, episodes=2)
@@ -92,18 +92,18 @@ def few_episodes():
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Callable[..., Path]:
-    """Return a function from names of algorithms to a suite that contains their populations. Read only."""
+    """Return a function that trains populations of the given algorithms once and returns their suite (read-only)."""
     root = tmp_path_factory.mktemp("trained")
 
     def train(*algorithms: str) -> Path:
         for algorithm in algorithms:
-            job_of(algorithm, root).run()
+            population_job(algorithm, root).run()
         return root
 
     return train
 
 
-def population(root: Path, algorithm: str) -> Path:
+def population_folder(root: Path, algorithm: str) -> Path:
     return root / LAYOUT.name / algorithm
 
 
@@ -116,14 +116,14 @@ def weight_hashes(folder: Path) -> dict[str, str]:
 @EACH_KIND
 def test_population_has_five_checkpoints_of_each_member(trained, algorithm):
     found = list(suite_checkpoints(trained(algorithm), LAYOUT.name, algorithm))
-    first = int(algorithm == "comedi")  # CoMeDi's policy 0 is trained only by self-play and is no teammate
+    first = int(algorithm == "comedi")  # CoMeDi's policy 0 is trained only by self-play and is not a teammate
     names = [f"{LAYOUT.name}/{algorithm}/m{m}/c{c}" for m in range(first, first + 2) for c in range(5)]
     assert [point.path for point in found] == names
-    folder = population(trained(algorithm), algorithm)
+    folder = population_folder(trained(algorithm), algorithm)
     responses = ["m0", "m1"] if algorithm in ("brdiv", "lbrdiv") else []
     assert sorted(path.name for path in folder.glob("responses/*")) == responses
     assert len(set(weight_hashes(folder).values())) == 5 * first + 10 + len(responses), "all policies differ"
-    assert job_of(algorithm, trained(algorithm)).is_finished()
+    assert population_job(algorithm, trained(algorithm)).is_finished()
     assert not list(folder.glob("resume*"))
 
 
@@ -147,7 +147,7 @@ def test_cards_describe_checkpoints_of_a_population(trained, algorithm):
 @pytest.mark.slow
 def test_returns_on_cards_are_those_of_the_checkpoints(trained):
     """Evaluate the last checkpoints with their best responses again and compare with the stored returns."""
-    folder = population(trained("lbrdiv"), "lbrdiv")
+    folder = population_folder(trained("lbrdiv"), "lbrdiv")
     loaded = [load_policy(folder / f"m{m}/c4") for m in range(2)]
     members = stacked([params for _, params, _ in loaded])
     responses = stacked([load_policy(folder / f"responses/m{m}")[1] for m in range(2)])
@@ -159,7 +159,7 @@ def test_returns_on_cards_are_those_of_the_checkpoints(trained):
 @pytest.mark.slow
 @EACH_KIND
 def test_population_log_has_a_line_for_each_update(trained, algorithm):
-    folder = population(trained(algorithm), algorithm)
+    folder = population_folder(trained(algorithm), algorithm)
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     stages = 3 if algorithm == "comedi" else 1
     assert [(line["stage"], line["update"]) for line in lines] == [(s, u) for s in range(stages) for u in range(6)]
@@ -175,51 +175,51 @@ def test_population_log_has_a_line_for_each_update(trained, algorithm):
     assert all(line["steps_per_second"] > 0 for line in timing)
 
 
-class Stopped(Exception):
+class StopTraining(Exception):
     pass
 
 
 @pytest.fixture
-def stopped(tmp_path, monkeypatch) -> Path:
-    """Return a suite with an LBRDiv training run, stopped in its last update, when multipliers have changed."""
+def stopped_suite(tmp_path, monkeypatch) -> Path:
+    """Return a suite in which LBRDiv training stopped at its last update, after multipliers had changed."""
 
     def stop(updates: int, speed: float) -> None:
-        if updates == run_of("lbrdiv").updates:
-            raise Stopped
+        if updates == smoke_run("lbrdiv").updates:
+            raise StopTraining
 
-    with pytest.raises(Stopped):
-        job_of("lbrdiv", tmp_path).run(stop, save_seconds=0.0)
+    with pytest.raises(StopTraining):
+        population_job("lbrdiv", tmp_path).run(stop, save_seconds=0.0)
     return tmp_path
 
 
 @pytest.mark.slow
-def test_stopped_population_resumes_only_with_the_same_settings(trained, stopped):
-    before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
+def test_stopped_population_resumes_only_with_the_same_settings(trained, stopped_suite):
+    before = {path: path.read_bytes() for path in stopped_suite.rglob("*") if path.is_file()}
     with pytest.raises(
         OptionError,
         match=r"lbrdiv.resume\.safetensors: saved by a training run with other settings: seed was 0, now it is 1",
     ):
-        PopulationJob(replace(run_of("lbrdiv"), seed=1), stopped).run()
-    assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before
+        PopulationJob(replace(smoke_run("lbrdiv"), seed=1), stopped_suite).run()
+    assert {path: path.read_bytes() for path in stopped_suite.rglob("*") if path.is_file()} == before
 
     done: list[int] = []
-    job_of("lbrdiv", stopped).run(lambda updates, speed: done.append(updates))
+    population_job("lbrdiv", stopped_suite).run(lambda updates, speed: done.append(updates))
     assert done == [6]
-    folders = [population(suite, "lbrdiv") for suite in (stopped, trained("lbrdiv"))]
+    folders = [population_folder(suite, "lbrdiv") for suite in (stopped_suite, trained("lbrdiv"))]
     assert weight_hashes(folders[0]) == weight_hashes(folders[1])
     assert not compare_rebuilds(*folders).differences
 
 
 def test_second_training_in_a_locked_folder_raises_error(tmp_path):
-    with run_lock(population(tmp_path, "fcp")), pytest.raises(BusyError, match="another process works in"):
-        job_of("fcp", tmp_path).run()
+    with run_lock(population_folder(tmp_path, "fcp")), pytest.raises(BusyError, match="another process works in"):
+        population_job("fcp", tmp_path).run()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [f"m0/c0/{POLICY_WEIGHTS}", f"m1/c4/{POLICY_CARD}", f"responses/m1/{POLICY_WEIGHTS}"])
 def test_population_with_changed_or_missing_file_is_unfinished(trained, tmp_path, name):
-    folder, job = population(tmp_path, "lbrdiv"), job_of("lbrdiv", tmp_path)
-    shutil.copytree(population(trained("lbrdiv"), "lbrdiv"), folder)
+    folder, job = population_folder(tmp_path, "lbrdiv"), population_job("lbrdiv", tmp_path)
+    shutil.copytree(population_folder(trained("lbrdiv"), "lbrdiv"), folder)
     assert job.is_finished()
     flip_bit(folder / name)
     assert not job.is_finished()
@@ -235,7 +235,7 @@ def test_checkpoints_of_an_unfinished_population_raise_error(tmp_path):
 @pytest.mark.slow
 def test_population_on_two_devices_learns_the_same_policies(tmp_path):
     """After one update with half of the policies on each device, parameters agree up to rounding."""
-    (stage,) = run_of("fcp").stages
+    (stage,) = smoke_run("fcp").stages
     state, _ = jax.jit(stage.update)(jax.jit(stage.init)(jax.random.fold_in(jax.random.key(0), 0)))
     flags = add_xla_flag("--xla_force_host_platform_device_count=2")
     process = start_python("-c", TWO_DEVICES, str(tmp_path / "weights.npz"), XLA_FLAGS=flags)
@@ -247,9 +247,9 @@ def test_population_on_two_devices_learns_the_same_policies(tmp_path):
         np.testing.assert_allclose(found[name], leaf, rtol=0, atol=1e-4, err_msg=name)
 
 
-def write_invented(root: Path, returns: dict[tuple[int, int], float], algorithm: str = "fcp") -> Path:
-    """Write a suite with invented returns of teammates, by (member, checkpoint); all weight files differ."""
-    folder = population(root, algorithm)
+def write_suite_with_returns(root: Path, returns: dict[tuple[int, int], float], algorithm: str = "fcp") -> Path:
+    """Write a suite whose checkpoints (member, checkpoint) have the given returns; all weight files differ."""
+    folder = population_folder(root, algorithm)
     for (member, checkpoint), greedy in returns.items():
         params = {"params": {"x": np.array([member, checkpoint, ALGORITHMS.index(algorithm)], np.float32)}}
         card = {"algorithm": algorithm, "member": member, "seed": 7, "teammate_return": greedy, "return": -greedy}
@@ -266,7 +266,7 @@ def candidates(tmp_path_factory) -> Path:
     for algorithm in ALGORITHMS:
         returns = {(m, c): 21.0 + m + c for m in range(10) for c in range(5)}
         returns |= {(m, 0): 20.0 for m in range(5)} | {(m, 1): -3.0 for m in range(5)}
-        write_invented(root, returns, algorithm)
+        write_suite_with_returns(root, returns, algorithm)
     return root
 
 
@@ -300,7 +300,7 @@ def test_selection_depends_on_seed_and_algorithm(candidates):
 @pytest.mark.parametrize("seed", range(5))
 def test_members_are_selected_in_turn(tmp_path, seed):
     """Member 0 has four good checkpoints, members 1 and 2 have two each."""
-    write_invented(tmp_path, {(m, c): 30.0 for m, count in enumerate((4, 2, 2)) for c in range(count)})
+    write_suite_with_returns(tmp_path, {(m, c): 30.0 for m, count in enumerate((4, 2, 2)) for c in range(count)})
     chosen = select_teammates(tmp_path, LAYOUT.name, "fcp", 6, 1, seed=seed)
     members = [point.card["member"] for point in chosen.heldout + chosen.train]
     assert len(members) == 7
@@ -315,7 +315,7 @@ def test_members_are_selected_in_turn(tmp_path, seed):
 )
 def test_few_candidates_are_split_four_to_one_into_training_and_held_out(tmp_path, good, train, heldout):
     """The test asks for 20 teammates for training and 5 held-out teammates."""
-    write_invented(tmp_path, {(k // 5, k % 5): 30.0 if k < good else 5.0 for k in range(50)})
+    write_suite_with_returns(tmp_path, {(k // 5, k % 5): 30.0 if k < good else 5.0 for k in range(50)})
     chosen = select_teammates(tmp_path, LAYOUT.name, "fcp", 20, 5)
     assert (chosen.good, len(chosen.train), len(chosen.heldout)) == (good, train, heldout)
     assert not {*paths(chosen.train)} & {*paths(chosen.heldout)}

@@ -108,10 +108,10 @@ def test_rebuild_in_folder_with_other_files_raises_error(built, tmp_path):
 
 
 def test_rebuild_does_not_replace_release_of_another_profile(built, tmp_path, monkeypatch):
-    def forbidden(*arguments):
+    def fail_if_called(*arguments):
         raise AssertionError("expected an error before any task is collected")
 
-    monkeypatch.setattr(build, "run_jobs", forbidden)
+    monkeypatch.setattr(build, "run_jobs", fail_if_called)
     shutil.copytree(built / "a" / "lite", tmp_path / "lite")
     (tmp_path / "other.toml").write_text(TINY)
     with pytest.raises(
@@ -130,21 +130,21 @@ def test_bundle_release_replaces_the_bundled_release(built, monkeypatch, tmp_pat
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_measurements():
-    """Replace slow measurements with learned teammates: their distances, and the returns of checkpoints."""
+    """Return fixed values instead of slowly measuring distances and returns for learned teammates."""
     measure_checkpoints = labeller._measure
 
-    def measure(checkpoints, task, suite) -> CheckpointReturns:
+    def measure_unless_learned(checkpoints, task, suite) -> CheckpointReturns:
         if task.teammate_family != "rl":
             return measure_checkpoints(checkpoints, task, suite)
         returns = [[float(number)] * LABEL_EPISODES for number, _ in enumerate(checkpoints)]
         return CheckpointReturns(returns, returns)
 
-    def nearest(layout, policies) -> list[NearestTest]:
+    def fixed_nearest(layout, policies) -> list[NearestTest]:
         return [NearestTest("H4/t0", 0.5, number) for number, _ in enumerate(policies)]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(labeller, "_measure", measure)
-        patch.setattr(measures, "nearest_test", nearest)
+        patch.setattr(labeller, "_measure", measure_unless_learned)
+        patch.setattr(measures, "nearest_test", fixed_nearest)
         yield
 
 
@@ -181,7 +181,7 @@ def test_learned_teammates_of_a_release_reproduce_recorded_actions(learned_rebui
 
 @pytest.mark.slow
 def test_release_is_rebuilt_from_its_tasks_and_teammates(learned_rebuild, tmp_path):
-    """The rebuild trains no populations, and its files have the same bytes."""
+    """The rebuild trains no populations and writes the same bytes as the first build."""
     profile = tmp_path / "learned.toml"
     profile.write_text(LEARNED)
     given = ("--tasks", learned_rebuild / "lite/meta/tasks.jsonl", "--suite", learned_rebuild / "lite/teammates")
@@ -194,7 +194,7 @@ def test_release_is_rebuilt_from_its_tasks_and_teammates(learned_rebuild, tmp_pa
 
 
 @pytest.mark.slow
-def test_verify_names_a_changed_teammate_of_a_release(learned_rebuild, tmp_path):
+def test_verify_reports_the_changed_file_of_a_teammate(learned_rebuild, tmp_path):
     root = tmp_path / "lite"
     shutil.copytree(learned_rebuild / "lite", root)
     assert verify_release(root, level="deep").ok
@@ -222,12 +222,12 @@ def test_verify_and_recover_report_missing_teammate_checkpoints(learned_rebuild,
 
 @pytest.mark.slow
 def test_repeated_rebuild_runs_no_job_again(learned_rebuild, monkeypatch):
-    def forbidden(*arguments):
+    def fail_if_called(*arguments):
         raise AssertionError("a finished job was run again")
 
     monkeypatch.setattr(select, "THRESHOLD", -np.inf)
-    monkeypatch.setattr(suite._PopulationTraining, "train", forbidden)
-    monkeypatch.setitem(job._GENERATORS, "ppo", forbidden)
+    monkeypatch.setattr(suite._PopulationTraining, "train", fail_if_called)
+    monkeypatch.setitem(job._GENERATORS, "ppo", fail_if_called)
     assert rebuild(learned_rebuild.parent / "learned.toml", learned_rebuild).count("finished before") == 4
 
 

@@ -1,4 +1,4 @@
-"""Test the checkpoint that labels a task's histories: measured returns, the choice, and stored records."""
+"""Test the checkpoint that labels a task's histories: its choice by measured returns, and its stored policy."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ def returns_with_means(*means: float, spread: float = 0.0) -> np.ndarray:
     return np.array(means)[:, None] + noise - noise.mean(axis=1, keepdims=True)
 
 
-def test_last_checkpoint_labels_unless_an_earlier_one_is_clearly_better():
+def test_last_checkpoint_is_chosen_unless_an_earlier_one_is_clearly_better():
     assert choose_checkpoint(returns_with_means(0, 5, 10, 20, 20)) == 4
     assert choose_checkpoint(returns_with_means(0, 0, 0, 0, 0)) == 4
     assert choose_checkpoint(returns_with_means(7)) == 0
     assert choose_checkpoint(returns_with_means(0, 5, 16.9, 3, 0)) == 2
-    assert choose_checkpoint(returns_with_means(9, 5, 9, 3, 0)) == 2  # the later of two equal checkpoints
+    assert choose_checkpoint(returns_with_means(9, 5, 9, 3, 0)) == 2  # the later of two equal checkpoints is chosen
 
 
 def test_earlier_checkpoint_must_be_better_by_2_and_by_two_standard_errors():
@@ -70,19 +70,19 @@ def task(built, tmp_path):
     profile = load_profile(str(built / "tiny.toml"))
     folder = tmp_path / "artefacts" / artefact(built / "a").name
     shutil.copytree(artefact(built / "a"), folder)
-    for kept in artefact(built / "a").parent.glob(".*.teammates.json"):  # measured returns of the teammate
+    for kept in artefact(built / "a").parent.glob(".*.teammates.json"):  # stored measurements of the teammate
         shutil.copy(kept, folder.parent)
     return profile.units()[0].task, profile, folder
 
 
-def with_returns(folder: Path, greedy: list[float]) -> None:
+def set_greedy_returns(folder: Path, greedy: list[float]) -> None:
     """Replace the measured greedy returns in an artefact by one constant for each checkpoint."""
     content = json.loads((folder / LABELLER_RETURNS).read_text())
     content["measured"]["greedy"] = [[value] * LABEL_EPISODES for value in greedy]
     (folder / LABELLER_RETURNS).write_text(json.dumps(content))
 
 
-def measured(folder: Path) -> dict:
+def stored_returns(folder: Path) -> dict:
     return json.loads((folder / LABELLER_RETURNS).read_text())["measured"]
 
 
@@ -93,18 +93,18 @@ def package_task(task: tuple[Task, Profile, Path], target: Path, kind: Kind = "l
     return package_release(folder.parent, target, [Work(chosen)], replace(profile, **changes), target, kind, facts)
 
 
-def forbidden(*arguments):
+def fail_if_called(*arguments):
     raise AssertionError("returns were measured again")
 
 
 def test_packaging_measures_every_checkpoint_once(task, tmp_path, monkeypatch):
     chosen, profile, folder = task
-    found = measured(folder)
+    found = stored_returns(folder)
     for way in ("greedy", "sampled"):
         assert np.shape(found[way]) == (5, 200)
         assert (np.array(found[way]) % 5 == 0).all()  # rewards are multiples of 5
     assert len(np.unique(found["sampled"])) > 1
-    monkeypatch.setattr(labeller, "_measure", forbidden)
+    monkeypatch.setattr(labeller, "_measure", fail_if_called)
     package_task(task, tmp_path / "full", "full")
     assert is_task_finished(folder, Work(chosen), profile)
 
@@ -158,13 +158,13 @@ def test_measured_returns_equal_those_of_a_loop_over_steps(task):
     for key in jax.random.split(jax.random.key(0), 100):
         state, hidden, memory, reward = step(state, hidden, memory, key)
         returns += np.asarray(reward)
-    assert measured(folder)["greedy"][4] == returns.tolist()
+    assert stored_returns(folder)["greedy"][4] == returns.tolist()
 
 
 def test_clearly_better_earlier_checkpoint_labels_the_histories(task, tmp_path):
     chosen, _, folder = task
-    with_returns(folder, [0, 60, 20, 5, 0])
-    sampled = np.mean(measured(folder)["sampled"][1])
+    set_greedy_returns(folder, [0, 60, 20, 5, 0])
+    sampled = np.mean(stored_returns(folder)["sampled"][1])
     root = package_task(task, tmp_path / "lite")
     dataset = load_icrl4aht(root)
     network, params, card = load_policy(folder / "checkpoints/c1")
@@ -183,7 +183,7 @@ def test_clearly_better_earlier_checkpoint_labels_the_histories(task, tmp_path):
 
 
 @pytest.fixture
-def with_policies(task, tmp_path) -> Path:
+def release_with_policies(task, tmp_path) -> Path:
     """Return a release that contains the labelling policies."""
     return package_task(task, tmp_path / "with", policies=True)
 
@@ -192,23 +192,23 @@ def policy_files(root: Path) -> dict[str, str]:
     return {name: digest for name, digest in read_manifest(root).items() if name.startswith("experts/")}
 
 
-def test_labelling_policies_are_released_if_the_profile_says_so(built, with_policies, tmp_path):
+def test_profile_setting_policies_adds_labelling_policies_to_the_release(built, release_with_policies, tmp_path):
     assert not policy_files(built / "a" / "lite")
-    (of_task,) = read_provenance(with_policies / "meta/provenance.json").values()
+    (of_task,) = read_provenance(release_with_policies / "meta/provenance.json").values()
     assert of_task.expert is not None
     folder = f"experts/{of_task.expert.policy_sha256}"
-    files = policy_files(with_policies)
+    files = policy_files(release_with_policies)
     assert set(files) == {f"{folder}/{name}" for name in (POLICY_WEIGHTS, POLICY_CARD)}
     assert files[f"{folder}/{POLICY_WEIGHTS}"] == of_task.expert.policy_sha256
-    assert load_policy(with_policies / folder)[2]["steps"] == of_task.expert.step
-    assert verify_release(with_policies).ok
-    full = to_release(load_icrl4aht(with_policies), tmp_path / "full", "full")
+    assert load_policy(release_with_policies / folder)[2]["steps"] == of_task.expert.step
+    assert verify_release(release_with_policies).ok
+    full = to_release(load_icrl4aht(release_with_policies), tmp_path / "full", "full")
     assert policy_files(full) == files
     assert policy_files(combine_releases(tmp_path / "both", [full])) == files
 
 
-def test_verify_compares_labelling_policies_and_index_with_provenance(with_policies):
-    root = with_policies
+def test_verify_compares_labelling_policies_and_index_with_provenance(release_with_policies):
+    root = release_with_policies
     weights = next(root.glob("experts/*/policy.safetensors"))
     flip_bit(weights)
     provenance = json.loads((root / "meta/provenance.json").read_text())

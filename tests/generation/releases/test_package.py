@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from icrl4aht_generation.collection.curate import oracle_labels
-from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA, HistoryArrays
+from icrl4aht_generation.collection.task_folder import HISTORY_ARRAYS, LABELLER_RETURNS, METADATA
 from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.releases import measures
 from icrl4aht_generation.releases.measures import TeammateFacts, teammate_facts, unusable_families
@@ -41,21 +41,21 @@ def profile(built) -> Profile:
     return replace(load_profile(str(built / "tiny.toml")), learners=2, keep=4)
 
 
-def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequence[float], label: float) -> None:
+def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequence[float], greedy: float) -> None:
     """Write the artefact of a learner whose first streams improve by `improvements` within ten episodes.
 
-    Every checkpoint earns `label` in the measured greedy play.
+    Every checkpoint has the measured greedy return `greedy`.
     """
     folder = artefacts / work.name
     shutil.copytree(artefact(built / "a"), folder)
-    arrays = {name: np.load(folder / f"{name}.npy") for name in HistoryArrays._fields}
+    arrays = {name: np.load(folder / f"{name}.npy") for name in HISTORY_ARRAYS}
     for name, array in arrays.items():
         np.save(folder / f"{name}.npy", np.concatenate([array, array], axis=1))
     rewards = np.zeros((8, 10, 100), np.int8)
     rewards[: len(improvements), 5:, 0] = np.array(improvements)[:, None]
     np.save(folder / "rewards.npy", rewards.reshape(8, -1))
     measured = json.loads((folder / LABELLER_RETURNS).read_text())
-    measured["measured"]["greedy"] = [[label] * LABEL_EPISODES] * 5
+    measured["measured"]["greedy"] = [[greedy] * LABEL_EPISODES] * 5
     (folder / LABELLER_RETURNS).write_text(json.dumps(measured))
 
 
@@ -63,7 +63,7 @@ def make_noise(built: Path, work: Work, artefacts: Path) -> None:
     """Write the artefact of a task with two noise histories."""
     source, folder = artefact(built / "a"), artefacts / work.name
     folder.mkdir(parents=True)
-    for name in HistoryArrays._fields:
+    for name in HISTORY_ARRAYS:
         np.save(folder / f"{name}.npy", np.load(source / f"{name}.npy")[:2])
     np.save(folder / "script_actions.npy", np.arange(1000).reshape(2, 500).astype(np.int8) % 6)
     metadata = json.loads((source / METADATA).read_text())
@@ -80,7 +80,7 @@ def make_tasks(profile: Profile, count: int) -> list[Task]:
     return [first, *(make_task("teammate", "train", "demo_wide", entry, 7) for entry in entries[1:])]
 
 
-def pack(tmp_path: Path, profile: Profile, works: Sequence[Work], facts: dict[str, TeammateFacts]) -> Path:
+def package_tasks(tmp_path: Path, profile: Profile, works: Sequence[Work], facts: dict[str, TeammateFacts]) -> Path:
     return package_release(tmp_path / "artefacts", tmp_path / "release", works, profile, tmp_path, "lite", facts)
 
 
@@ -97,7 +97,7 @@ def two_learners(built, profile, tmp_path) -> list[Work]:
 def test_improving_streams_of_both_learners_are_kept(two_learners, profile, tmp_path):
     task_id = two_learners[0].task.task_id
     strict = replace(profile, least_improvement=5.0, oracle_actions=True)
-    root = pack(tmp_path, strict, two_learners, {task_id: MATTERS})
+    root = package_tasks(tmp_path, strict, two_learners, {task_id: MATTERS})
     dataset = load_icrl4aht(root)
     kept = [(entry.learner, entry.env_idx, entry.return_end - entry.return_start) for entry in dataset.entries]
     assert kept == [(0, 2, 20), (0, 3, 15), (0, 0, 10), (1, 1, 25)]
@@ -127,14 +127,16 @@ def test_oracle_labels_are_omitted_if_the_oracle_earns_less_than_learners(two_le
     task_id, references = two_learners[0].task.task_id, MATTERS.references
     assert references is not None
     facts = MATTERS._replace(references=replace_fields(references, oracle=-1000.0))
-    dataset = load_icrl4aht(pack(tmp_path, replace(profile, oracle_actions=True), two_learners, {task_id: facts}))
+    dataset = load_icrl4aht(
+        package_tasks(tmp_path, replace(profile, oracle_actions=True), two_learners, {task_id: facts})
+    )
     assert dataset.counts("label_view") == {"ego": len(dataset)}
     assert not dataset.has_labels("oracle").any()
 
 
-def test_least_improvement_is_not_required_without_headroom(two_learners, profile, tmp_path):
+def test_minimum_improvement_is_not_required_without_headroom(two_learners, profile, tmp_path):
     task_id = two_learners[0].task.task_id
-    root = pack(tmp_path, replace(profile, least_improvement=50.0), two_learners, {task_id: DOES_NOT})
+    root = package_tasks(tmp_path, replace(profile, least_improvement=50.0), two_learners, {task_id: DOES_NOT})
     kept = [(entry.learner, entry.env_idx) for entry in load_icrl4aht(root).entries]
     assert kept == [(0, 2), (0, 3), (1, 1), (1, 0)]
     assert not any(entry.has_oracle_actions for entry in load_icrl4aht(root).entries)
@@ -148,17 +150,17 @@ def test_tasks_without_improving_streams_or_headroom_are_left_out(built, two_lea
         make_learner(built, work, tmp_path / "artefacts", [4, 4], 0.0)
     strict = replace(profile, least_improvement=5.0)
     facts = {two_learners[0].task.task_id: MATTERS, flat.task_id: MATTERS}
-    root = pack(tmp_path, strict, works, facts)
+    root = package_tasks(tmp_path, strict, works, facts)
     (left_out,) = read_info(root).left_out
     assert (left_out.task_id, left_out.teammate, left_out.source) == (flat.task_id, "H4/t1", "ppo")
     assert (left_out.learners, left_out.streams, left_out.return_start, left_out.return_end) == (2, 16, 0, 1)
     assert "no stream's end exceeds its start by 5" in left_out.reason
     assert {entry.task_id for entry in load_icrl4aht(root).entries} == {two_learners[0].task.task_id}
     assert verify_release(root).findings == []
-    (left_out,) = read_info(pack(tmp_path, strict, works, facts | {flat.task_id: DOES_NOT})).left_out
+    (left_out,) = read_info(package_tasks(tmp_path, strict, works, facts | {flat.task_id: DOES_NOT})).left_out
     assert "the ego does not matter" in left_out.reason
     with pytest.raises(OptionError, match="no task has histories to keep: the learners did not learn"):
-        pack(tmp_path, strict, works[2:], facts)
+        package_tasks(tmp_path, strict, works[2:], facts)
 
 
 def test_tasks_with_little_mean_improvement_are_left_out(built, two_learners, profile, tmp_path):
@@ -167,14 +169,14 @@ def test_tasks_with_little_mean_improvement_are_left_out(built, two_learners, pr
     make_learner(built, work := Work(flat, "ppo"), tmp_path / "artefacts", [4, 6, 3, 5], 5.0)
     works, task_id = [*two_learners, work], two_learners[0].task.task_id
     rising = replace(profile, least_improvement=5.0, least_rise=17.0)
-    root = pack(tmp_path, rising, works, {task_id: MATTERS, flat.task_id: MATTERS})
+    root = package_tasks(tmp_path, rising, works, {task_id: MATTERS, flat.task_id: MATTERS})
     (left_out,) = read_info(root).left_out
     assert (left_out.task_id, left_out.streams) == (flat.task_id, 8)
     assert left_out.reason == "its histories rise by 5.5 on average, expected 17"
     assert {entry.task_id for entry in load_icrl4aht(root).entries} == {task_id}
     with pytest.raises(OptionError, match=r"rise by 17\.5 on average, expected 17\.6"):
-        pack(tmp_path, replace(rising, least_rise=17.6), two_learners, {task_id: MATTERS})
-    exempt = pack(tmp_path, replace(rising, least_rise=50.0), two_learners, {task_id: DOES_NOT})
+        package_tasks(tmp_path, replace(rising, least_rise=17.6), two_learners, {task_id: MATTERS})
+    exempt = package_tasks(tmp_path, replace(rising, least_rise=50.0), two_learners, {task_id: DOES_NOT})
     assert read_info(exempt).left_out == []
 
 
@@ -183,7 +185,7 @@ def test_noise_histories_are_labelled_by_their_scripted_ego(built, profile, tmp_
     work = Work(task, "noise")
     make_noise(built, work, tmp_path / "artefacts")
     both = replace(profile, sources=("noise",), oracle_actions=True, least_improvement=5.0)
-    root = pack(tmp_path, both, [work], {task.task_id: MATTERS})
+    root = package_tasks(tmp_path, both, [work], {task.task_id: MATTERS})
     dataset = load_icrl4aht(root)
     assert [(entry.source, entry.learner, entry.env_idx) for entry in dataset.entries] == [
         ("noise", 0, 0),
@@ -206,7 +208,7 @@ def test_noise_histories_are_labelled_by_their_scripted_ego(built, profile, tmp_
     arguments = ["--profile", built / "tiny.toml", "--tasks", root / "meta/tasks.jsonl", "--out", tmp_path / "out"]
     with pytest.raises(OptionError, match=f"task {task.task_id}: the source is noise, but profile tiny has ppo"):
         run_cli("generate", *arguments)
-    without = pack(tmp_path, replace(both, oracle_actions=False), [work], {task.task_id: MATTERS})
+    without = package_tasks(tmp_path, replace(both, oracle_actions=False), [work], {task.task_id: MATTERS})
     assert not any(entry.has_oracle_actions for entry in load_icrl4aht(without).entries)
 
 

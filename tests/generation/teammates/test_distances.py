@@ -60,17 +60,17 @@ def start_steps(params, key) -> jax.Array:
 
 
 def act_by_parameter(params, steps, view, key):
-    """Return the action that the parameter gives."""
+    """Return the parameter as the action."""
     return params, steps + 1
 
 
 def act_by_parameter_too(params, steps, view, key):
-    """Return the action that the parameter gives (a second function, equal to `act_by_parameter`)."""
+    """Return the parameter as the action, like `act_by_parameter`, but in a different function."""
     return params, steps + 1
 
 
 def test_reference_returns_are_in_the_order_of_the_teammates(monkeypatch):
-    """The reward is replaced by the ego's action (`stay` 4, oracle 1), plus 100 for the teammate's action 2."""
+    """The test replaces the reward by the number of the ego's action, plus 100 if the teammate's action is 2."""
 
     def with_fake_rewards(*arguments, **options) -> tuple[object, Rollout]:
         carry, played = roll_out(*arguments, **options)
@@ -89,7 +89,8 @@ def test_reference_returns_are_in_the_order_of_the_teammates(monkeypatch):
     np.testing.assert_array_equal(stay, [12, 312, 12])
     np.testing.assert_array_equal(oracle, [3, 303, 3])
     assert found.dtype == np.float64
-    np.testing.assert_array_equal(random - random[0], [0, 300, 0])  # the random ego's actions are equal
+    # The random ego takes the same actions with every teammate.
+    np.testing.assert_array_equal(random - random[0], [0, 300, 0])
     assert 0 < random[0] < 15
     np.testing.assert_array_equal(reference_returns(LAYOUT, mates[1:], episodes=2), found[1:])
 
@@ -111,7 +112,7 @@ def test_test_teammate_has_distance_0_to_itself():
 
 @pytest.mark.slow
 def test_measured_draws_equal_the_stored_table():
-    """Draws of both seeds agree except in the number of the behaviour, which depends on earlier draws."""
+    """Values measured again agree, except for the number of the behaviour, which depends on earlier draws."""
     numbers = [("assembly_line", 0, 0), ("assembly_line", 0, 31), ("assembly_line", 1, 5)]
     for found, (family, base_seed, theta_id) in zip(measure_draws(SHIPPED, numbers), numbers, strict=True):
         expected = read_draws(SHIPPED.name, family, base_seed)[theta_id]

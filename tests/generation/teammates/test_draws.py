@@ -1,4 +1,4 @@
-"""Test teammates with drawn parameters: the shipped table of measured draws, and the choice for tasks."""
+"""Test teammates with drawn parameters: the shipped table of measured draws, and the choice of draws for tasks."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def use_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *found: Draw) -> 
     monkeypatch.setattr(draws, "_bundled_draws", UNCACHED)
 
 
-def chosen(*arguments, **options) -> list[tuple[str, int]]:
+def chosen_draws(*arguments, **options) -> list[tuple[str, int]]:
     return [(found.family, found.theta_id) for _, found in drawn_teammates("demo_wide", *arguments, **options)]
 
 
@@ -130,10 +130,10 @@ def test_diverse_teammates_differ_from_test_teammates_and_each_other(track):
 def test_draws_alternate_between_families_and_start_with_new_behaviours(monkeypatch, tmp_path):
     h1 = [draw(H1, 0), draw(H1, 1), draw(H1, 2, behaviour=4), draw(H1, 3, behaviour=4), draw(H1, 4, behaviour=2)]
     use_table(monkeypatch, tmp_path, *h1, draw(H3, 5), draw(H3, 6))
-    assert chosen([H1], 5) == [(H1, 0), (H1, 2), (H1, 4), (H1, 1), (H1, 3)]
-    assert chosen([H3, H1], 6) == [(H3, 5), (H1, 0), (H3, 6), (H1, 2), (H1, 4), (H1, 1)]
-    assert chosen([H3, H1, H3], 2) == [(H3, 5), (H1, 0)]
-    assert chosen([], 0) == chosen([H1], 0) == []
+    assert chosen_draws([H1], 5) == [(H1, 0), (H1, 2), (H1, 4), (H1, 1), (H1, 3)]
+    assert chosen_draws([H3, H1], 6) == [(H3, 5), (H1, 0), (H3, 6), (H1, 2), (H1, 4), (H1, 1)]
+    assert chosen_draws([H3, H1, H3], 2) == [(H3, 5), (H1, 0)]
+    assert chosen_draws([], 0) == chosen_draws([H1], 0) == []
 
 
 def test_draws_with_more_headroom_come_first(monkeypatch, tmp_path):
@@ -147,13 +147,13 @@ def test_draws_with_more_headroom_come_first(monkeypatch, tmp_path):
     unlike = replace(draw(H1, 7, behaviour=3, oracle=10.0), other="H4/t0", other_distance=0.02)
     use_table(monkeypatch, tmp_path, *first, *others, like, unlike)
     assert [found.spread for found in first] == [19.0, 49.0, 32.0]
-    assert [theta_id for _, theta_id in chosen([H1], 8)] == [1, 2, 0, 7, 4, 3, 5, 6]
+    assert [theta_id for _, theta_id in chosen_draws([H1], 8)] == [1, 2, 0, 7, 4, 3, 5, 6]
 
 
 def test_draws_similar_to_a_test_teammate_are_left_out(monkeypatch, tmp_path):
     use_table(monkeypatch, tmp_path, draw(H1, 0, distance=0.0199), draw(H1, 1, distance=0.02), draw(H2, 0, distance=0))
     assert usable_families("demo_wide") == [H1]
-    assert chosen([H1], 1) == [(H1, 1)]
+    assert chosen_draws([H1], 1) == [(H1, 1)]
     with pytest.raises(
         OptionError, match=f"1 draws act like a test teammate .*distance 0.000.*0.02 or more, to H3/t0.*1 of {H1}"
     ):
@@ -163,11 +163,11 @@ def test_draws_similar_to_a_test_teammate_are_left_out(monkeypatch, tmp_path):
 def test_draws_without_headroom_are_left_out_if_other_draws_have_headroom(monkeypatch, tmp_path):
     flat, wide = draw(H1, 0, oracle=5.9), draw(H1, 1, oracle=6.0)
     use_table(monkeypatch, tmp_path, flat, wide, draw(H3, 0, oracle=5.9))
-    assert chosen([H1], 1) == [(H1, 1)]
+    assert chosen_draws([H1], 1) == [(H1, 1)]
     with pytest.raises(OptionError, match=f"{H3}: with none of the 1 draws .* differ by 4.9 .*differ by 5 or more"):
         drawn_teammates("demo_wide", [H3], 1)
     use_table(monkeypatch, tmp_path, flat, replace(wide, distance=0.01), draw(H3, 0, oracle=5.9))
-    assert chosen([H1, H3], 2) == [(H1, 0), (H3, 0)]
+    assert chosen_draws([H1, H3], 2) == [(H1, 0), (H3, 0)]
 
 
 def test_unknown_names_of_draws_raise_errors():

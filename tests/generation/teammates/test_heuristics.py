@@ -1,5 +1,5 @@
 """Test the heuristic teammates: published actions and mean returns, every family on every layout as either agent,
-rules that published play does not reach, and random numbers."""
+rules that published episodes do not cover, and random numbers."""
 
 from __future__ import annotations
 
@@ -96,9 +96,9 @@ def start_records(name: str) -> np.ndarray:
 
 @cache
 def played(name: str, family: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return actions (100, 5, 129) and returns (5, 129) of t0..t4 as agent 1, with published noise.
+    """Return actions (100, 5, 129) and returns (5, 129) of a family's five published teammates as agent 1.
 
-    The ego always stays. The last episode starts from the published state and has a constant recipe.
+    Noise is as published, and the ego always stays. The last episode has the published start and a constant recipe.
     """
     layout, records = LAYOUTS[name], start_records(name)
     entries = published_teammates(name, family)
@@ -181,7 +181,7 @@ def compiled_teammates() -> tuple[dict, Callable]:
     return policies, jax.jit(jax.vmap(act, in_axes=(0, 0, 0, None)))
 
 
-def padded(layout: Layout, records: np.ndarray) -> tuple[Tables, np.ndarray]:
+def pad_inputs(layout: Layout, records: np.ndarray) -> tuple[Tables, np.ndarray]:
     """Return tables and records padded to common shapes, so that all layouts share one compilation."""
     tables, _, positions = padded_layout(layout)
     found = np.zeros((len(records), record_size(tables)), np.uint8)
@@ -191,7 +191,7 @@ def padded(layout: Layout, records: np.ndarray) -> tuple[Tables, np.ndarray]:
 
 def act_all(layout: Layout, params: dict, memories: dict, records: np.ndarray) -> dict:
     _, act = compiled_teammates()
-    tables, records = padded(layout, records)
+    tables, records = pad_inputs(layout, records)
     inputs = ([part[slot] for slot in ALL_SLOTS] for part in (params, memories))
     return dict(zip(ALL_SLOTS, act(*inputs, records, tables), strict=True))
 

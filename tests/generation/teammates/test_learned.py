@@ -39,7 +39,7 @@ def save(folder: Path, layout: Layout = LAYOUT, widths: Widths = WIDTHS, partner
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory) -> Path:
-    """Return a suite with checkpoints a (its critic receives one of four partners), b, and c (for test_simple)."""
+    """Return a suite with checkpoints a and b, and c for layout test_simple; only the critic of a sees the partner."""
     root = tmp_path_factory.mktemp("suite")
     save(root / "a", partners=4)
     save(root / "b", seed=1)
@@ -53,7 +53,7 @@ def states(steps: int, seed: int) -> np.ndarray:
 
 
 def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.ndarray:
-    """Return logits (T, N, 6) of the network, including the critic's part, for a sequence of states."""
+    """Return logits (T, N, 6) of the network, built with its critic, for a sequence of states."""
     obs = observe(LAYOUT, record, slot)
     network = ActorCritic(WIDTHS, partners)
     reset = np.arange(len(record))[:, None] == np.zeros(ENVS)
@@ -76,7 +76,7 @@ def played_actions(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("slot", [EGO, TEAMMATE])
-def test_greedy_action_is_the_likeliest_given_the_episodes_memory(tmp_path, slot):
+def test_greedy_action_is_the_most_probable_given_the_memory_of_the_episode(tmp_path, slot):
     params = save(tmp_path / "a", partners=4)
     record = states(STEPS, 2)
     logits = logits_of(params, 4, record, slot)
@@ -94,16 +94,16 @@ def test_sampled_actions_follow_the_policys_probabilities(suite):
     probability = np.exp(logits) / np.exp(logits).sum()
     obs, keys = observe(LAYOUT, record[0, 0], TEAMMATE), jax.random.split(jax.random.key(1), 3000)
 
-    def draws(policy):
+    def draw_actions(policy):
         many = jax.vmap(policy.act, in_axes=(None, None, None, 0))
         hidden = policy.init(policy.params, jax.random.key(0))
         return np.asarray(jax.jit(many)(policy.params, hidden, obs, keys)[0])
 
-    shares = np.bincount(draws(sampled), minlength=len(ACTIONS)) / 3000
+    shares = np.bincount(draw_actions(sampled), minlength=len(ACTIONS)) / 3000
     bound = 5 * (probability * (1 - probability) / 3000) ** 0.5 + 1e-3
     assert (np.abs(shares - probability) < bound).all()
     assert np.sort(probability)[-2] > 0.05
-    np.testing.assert_array_equal(draws(greedy), logits.argmax())
+    np.testing.assert_array_equal(draw_actions(greedy), logits.argmax())
 
 
 def test_policies_of_different_checkpoints_share_compiled_functions(suite):

@@ -1,4 +1,4 @@
-"""Test spread teammates, which behave very differently: the choice, the shipped list, and random actions."""
+"""Test spread teammates, whose actions differ widely: their choice, the shipped list, and random actions."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def small_spread(monkeypatch) -> LayoutSpread:
 
 
 def test_the_farthest_candidate_is_chosen_next():
-    """On a line, both end points are chosen first, then the middle; the point 0.05 is too near to the point 0."""
+    """On a line, both end points are chosen first, then the middle; the point 0.05 is too near the point 0."""
     assert choose_spread(DISTANCES, 0.1, 9) == ([0, 3, 2], [1.0, 1.0, pytest.approx(0.35)])
     assert choose_spread(DISTANCES, 0.04, 9)[0] == [0, 3, 2, 4, 1]
     assert choose_spread(DISTANCES, 0.05, 2)[0] == [0, 3]
@@ -91,7 +91,7 @@ def test_request_for_too_many_spread_teammates_raises_error(small_spread):
         read_spread("asymm_right")
 
 
-def test_measured_values_are_found_by_the_teammate_entry(small_spread):
+def test_measured_values_are_looked_up_by_teammate_entry(small_spread):
     found = find_measured("demo_wide", small_spread.chosen[1].entry)
     assert found is not None
     assert (found.behaviour, found.nearest, found.other_distance, found.oracle) == (1, "H4/t0", 0.4, 30.0)
@@ -109,7 +109,7 @@ def test_spread_table_counts_teammates_and_families(small_spread):
 
 
 @pytest.mark.parametrize("layout", TESTED_ON)
-def test_listed_teammates_differ_by_the_least_distance(layout):
+def test_listed_teammates_differ_by_at_least_the_minimum_distance(layout):
     spread = read_spread(layout)
     assert 0 < len(spread.chosen) <= MOST_CHOSEN
     assert min(mate.separation for mate in spread.chosen) >= DIVERSE_DISTANCE
@@ -168,7 +168,7 @@ def test_teammate_acts_randomly_with_the_given_probability():
     half, whole = (actions_of({"a": 0.5, RANDOM_ACTIONS: chance}) for chance in (0.5, 1.0))
     assert abs((half != 5).mean() - 0.5 * 5 / 6) < 0.08
     assert all(abs((whole == action).mean() - 1 / 6) < 0.07 for action in range(6))
-    np.testing.assert_array_equal(half[half != 5], whole[half != 5])  # both use equal random numbers
+    np.testing.assert_array_equal(half[half != 5], whole[half != 5])  # both episodes use the same random numbers
 
 
 def test_random_actions_with_fixed_noise_repeat_in_every_episode():

@@ -122,8 +122,8 @@ def test_broken_teammate_and_method_plugins_raise_errors(plugin_folder):
         assert get_method("my_ad")(ModelOptions(), world).label == get_method("ad")(ModelOptions(), world).label
         for name, problem in {
             "three": "expected a Callable, found int: 3",
-            "their_ad": "expected name 'their_ad' and data 'ad' or 'dpt', found name 'my_ad'",
-            "no_ad": "expected a function that returns a Method, found result None",
+            "their_ad": r"a Method with name 'their_ad' and data 'ad' or 'dpt', found Method\(name='my_ad'",
+            "no_ad": "expected a function that returns a Method with name 'no_ad' .*, found None",
         }.items():
             with pytest.raises(PluginError, match=f"rooms 0.1, entry point icrl4aht.methods: {name} .*{problem}"):
                 get_method(name)(ModelOptions(), world)
