@@ -8,17 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
-import pandas as pd
-from rich.console import Console
 
 from icrl4aht_baselines.agents.egos import NamedEgo, find_agent
 from icrl4aht_baselines.evaluate.protocols import Protocol, bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.page import write_page
-from icrl4aht_baselines.report.results import EPISODE_BLOCKS, EvaluationRun, evaluate_agent, mean_of
-from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
+from icrl4aht_baselines.report.results import EPISODE_BLOCKS, EvaluationRun, evaluate_agent
+from icrl4aht_baselines.report.scores import blocks_text
+from icrl4aht_baselines.report.statistics import mean_interval
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
@@ -26,11 +26,9 @@ from icrl4aht_baselines.training.trainer import show_steps
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, PREFERENCE
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
+from icrl4aht_data.dataset import MINI, load_icrl4aht
 from icrl4aht_data.errors import ReleaseError
-from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.overcooked.render import save_episode
-from icrl4aht_data.plotting import check_can_draw, legend_below, plot_learning_curves, save_figure
+from icrl4aht_data.plotting import check_can_draw, legend_below, save_figure
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 
@@ -73,12 +71,11 @@ class DemoSettings:
     seeds: Sequence[int] = range(24)
 
 
-def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) -> Path:
+def run_demo(out: Path, settings: DemoSettings | None = None) -> Path:
     """Run the demo: load, sample and verify a release; train a model; evaluate it with and without memory; draw.
 
     Args:
         out: output folder; the same call with this folder resumes a stopped demo.
-        console: console for the printed text.
         settings: settings of the demo.
 
     Returns:
@@ -91,32 +88,26 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     check_can_draw()
     started = time.perf_counter()
     settings = settings or DemoSettings()
-    paths = [out / name for name in ("learning_curves.png", "episode.gif", "adaptation.png", "report.html")]
-    for path in paths:
+    picture, page = out / "adaptation.png", out / "report.html"
+    for path in (picture, page):
         check_output(path, overwrite=(out / "run").is_dir())  # a stopped demo is resumed
     out.mkdir(parents=True, exist_ok=True)
-    curves, episode, picture, page = paths
 
     def print_stage(number: int, text: str) -> None:
-        console.print(f"[bold]{number}/6[/bold] ({time.perf_counter() - started:.0f} s) {text}")
-
-    def print_text(text: str) -> None:
-        console.print(text, highlight=False, markup=False)
+        click.echo(f"{click.style(f'{number}/6', bold=True)} ({time.perf_counter() - started:.0f} s) {text}")
 
     print_stage(1, f'ds = load_icrl4aht(split="train", layout="{DEMO_LAYOUT}", source="{_SOURCE}")')
     dataset = load_icrl4aht(settings.root, split="train", layout=DEMO_LAYOUT, source=_SOURCE)
-    plot_learning_curves(load_icrl4aht(settings.root), curves)
-    _draw_best_episode(dataset, episode)
-    print_text(f"{dataset!r}\nlearning curves: {curves}\nbest episode: {episode}")
+    click.echo(repr(dataset))
 
     print_stage(2, 'ds.ad(batch_size=8, length=500, labels="expert")[0]')
-    print_text(dataset.ad(batch_size=8, length=500, labels="expert")[0].describe())
+    click.echo(dataset.ad(batch_size=8, length=500, labels="expert")[0].describe())
 
     print_stage(3, "verifying every byte and every step")
     verified = verify_release(settings.root, level="deep")
     if not verified.ok:
         raise ReleaseError(f"{settings.root}: {verified.findings[0].file}: {verified.findings[0].problem}")
-    print_text(
+    click.echo(
         f"no problem in {verified.files} files, {verified.chunks} chunks, {verified.transitions:,} transitions replayed"
     )
 
@@ -127,7 +118,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     job = prepare("hybrid_ad", settings.model, training, histories)
     with progress_bars(unit="steps") as show:
         job.train(run, done=show_steps(show, "Hybrid-AD", training.steps))
-    print_text(f"losses on training and held-out histories: {run / RUN_CURVES}")
+    click.echo(f"losses on training and held-out histories: {run / RUN_CURVES}")
 
     every = bundled_tasks(PREFERENCE, "validation")  # new teammates, but the dishes of training
     tasks = settings.tasks or [task for task in every if task.layout.name == DEMO_LAYOUT]
@@ -140,49 +131,24 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
 
     own, cleared = evaluate_into(agent, agent.name), evaluate_into(agent, "cleared", control="cleared")
     runs = [own, cleared, *(evaluate_into(find_agent(name), name) for name in _AGENTS)]
-    print_text(block_table(runs).to_string())
+    for run in runs:
+        click.echo(f"{run.agent}, mean return by episode {blocks_text([*run.returns.values()])}")
 
     print_stage(6, "drawing")
     draw_adaptation(runs, picture)
     write_page(runs, page)
-    print_text(f"return by episode: {picture}\nreport: {page}")
-    print_text(f"done in {time.perf_counter() - started:.0f} s\n\n{conclusion(own, cleared)}")
+    click.echo(f"return by episode: {picture}\nreport: {page}")
+    click.echo(f"done in {time.perf_counter() - started:.0f} s\n\n{conclusion(own, cleared)}")
     return page
-
-
-def block_table(runs: Sequence[EvaluationRun]) -> pd.DataFrame:
-    """Return a table of mean returns, with a row for each agent and a column for each block of episodes."""
-    means = {
-        run.agent: {block: mean_of(of.blocks[block] for of in run.returns.values()) for block in _played_blocks(run)}
-        for run in runs
-    }
-    return pd.DataFrame(means).T.map("{:z.1f}".format).rename(columns="episodes {}".format)
-
-
-def _played_blocks(run: EvaluationRun) -> list[str]:
-    """Return the names of the blocks of episodes that were played in all tasks of a run."""
-    return [block for block in EPISODE_BLOCKS if all(block in of.blocks for of in run.returns.values())]
-
-
-def mean_gain(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInterval:
-    """Return a run's return in its last block of episodes minus that in its first episode, or minus another run's.
-
-    Differences are paired by task and seed. Each combination of layout and teammate family has the same weight.
-
-    Args:
-        run: results of an agent.
-        other: results of another agent; if given, its return in the last block is subtracted.
-    """
-    last = _played_blocks(run)[-1]
-    base, block = (run, "1") if other is None else (other, last)
-    return mean_interval(
-        *(of.blocks[last][0] - base.returns[cell].blocks[block][0] for cell, of in run.returns.items())
-    )
 
 
 def conclusion(own: EvaluationRun, cleared: EvaluationRun) -> str:
     """Return text that says whether the model learns within its context, and how far the measurement can be trusted."""
-    rise, memory = mean_gain(own), mean_gain(own, cleared)
+    last = next(block for block in reversed(EPISODE_BLOCKS) if all(block in of.blocks for of in own.returns.values()))
+    ends = {cell: of.blocks[last][0] for cell, of in own.returns.items()}
+    # Differences are paired by task and seed. Each combination of layout and teammate family has the same weight.
+    rise = mean_interval(*(end - own.returns[cell].blocks["1"][0] for cell, end in ends.items()))
+    memory = mean_interval(*(end - cleared.returns[cell].blocks[last][0] for cell, end in ends.items()))
     verdict = "rises by what it remembers" if rise.low > 0 and memory.low > 0 else "does not rise by what it remembers"
     return (
         f"Its return {verdict}: {rise.text(sign='+')} from the first episode to the last ones, {memory.text(sign='+')} "
@@ -213,12 +179,3 @@ def draw_adaptation(runs: Sequence[EvaluationRun], path: Path) -> None:
     axes.axhline(0, color="gray", linewidth=0.6)
     legend_below(figure)
     save_figure(figure, path)
-
-
-def _draw_best_episode(dataset: Dataset, path: Path) -> None:
-    """Draw the best episode of the history with the highest final return, the latest one if several are equal."""
-    history = dataset[int(np.argmax(dataset.column("return_end")))]
-    returns = history.returns()
-    best = len(returns) - 1 - int(np.argmax(returns[::-1]))
-    steps = slice(best * KEPT_STEPS, (best + 1) * KEPT_STEPS)
-    save_episode(path, get_layout(history.entry.layout), history.state[steps], history.rewards[steps])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -25,7 +25,7 @@ HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
 """Layout -> teammate family -> reference ego -> mean return."""
 
 
-def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., None]) -> list[EvaluationRun]:
+def measure_headroom(out: Path, protocols: Sequence[str]) -> list[EvaluationRun]:
     """Evaluate every reference ego under every protocol; results are stored in OUT/PROTOCOL/AGENT and reused.
 
     The ego `stay` also plays the validation tasks, since scores are relative to its returns. Under the protocol of the
@@ -34,15 +34,14 @@ def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., No
     Args:
         out: folder of the results.
         protocols: names of the protocols.
-        show: function for progress, called with (name, episodes played, number of episodes).
     """
     runs = []
     for protocol, agent in product(protocols, REFERENCES):
         seeds = SUBMITTED_SEEDS if protocol == SUBMITTED_PROTOCOL else (0,)
         splits = EVALUATION_SPLITS if agent == "stay" else ("test",)
         tasks = [task for split, track in product(splits, TRACKS) for task in bundled_tasks(track, split)]
-        rules, shown = get_protocol(protocol), {"show": show, "what": f"{agent}, {protocol}"}
-        runs.append(evaluate_agent(find_agent(agent), tasks, rules, out / protocol / agent, seeds=seeds, **shown))
+        folder = out / protocol / agent
+        runs.append(evaluate_agent(find_agent(agent), tasks, get_protocol(protocol), folder, seeds=seeds))
     return runs
 
 

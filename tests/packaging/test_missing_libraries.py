@@ -47,7 +47,7 @@ USES: list[tuple[str, str, Callable[[Any], object]]] = [
     ("minari", "minari", lambda dataset: to_minari(dataset, Path("some-v0"))),
     ("PIL.Image", "plot", lambda dataset: draw_frame(dataset.layouts[0], dataset[0].state[0])),
     ("matplotlib.figure", "plot", lambda dataset: new_figure(1, 1)),
-    *((library, "plot", lambda dataset: run_demo(Path("out"), QUIET)) for library in ("matplotlib", "PIL")),
+    *((library, "plot", lambda dataset: run_demo(Path("out"))) for library in ("matplotlib", "PIL")),
     *(
         (library, "plot", lambda dataset: build_releases(load_profile("smoke"), Path("out"), ("lite",), QUIET))
         for library in ("matplotlib", "PIL")

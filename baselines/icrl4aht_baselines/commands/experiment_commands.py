@@ -73,7 +73,8 @@ def _ego_options(*own: Callable[[Any], Any], **default_text: str) -> Callable[[A
     """Return a decorator that adds the options of a command that trains egos, including its `own` training options."""
     training = dataclass_options(ResponseOptions, "training", exclude=("learning_rate",), default_text=default_text)
     seeds = click.option("--seeds", type=COUNT, default=3, help="Training runs of each ego, with different seeds.")
-    return shared.add_options(topic("Tasks", *shared.tasks_options), topic("Training", *own, seeds, training))
+    tasks, train = topic("Tasks", *shared.tasks_options), topic("Training", *own, seeds, training)
+    return lambda command: tasks(train(command))
 
 
 @click.command("control")
@@ -85,14 +86,9 @@ def control_command(out: Path) -> None:
     not adapt with their context cut off. Exits with 1 if a check fails.
     """
     from icrl4aht_baselines.control.control import format_checks, run_control
-    from icrl4aht_baselines.training.trainer import format_loss
 
     with progress_bars(unit="steps") as show:
-
-        def done(name: str, total: int, step: int, loss: float | None) -> None:
-            show(name, step, total, format_loss(loss))
-
-        checks = run_control(out, done=done)
+        checks = run_control(out, show)
     click.echo(format_checks(checks))
     if not all(check.passed for check in checks):
         sys.exit(1)
@@ -120,8 +116,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
     folders = [out, card_file("headroom.json").parent] if bundle else [out]
     for folder in folders:
         check_output(folder, overwrite=True, names=HEADROOM_FILES)
-    with progress_bars(unit="episodes") as show:
-        runs = measure_headroom(out, protocol, show)
+    runs = measure_headroom(out, protocol)
     alike = find_equal_teammates()
     for path in (path for folder in folders for path in write_headroom_cards(runs, alike, folder)):
         click.echo(f"wrote {path}")

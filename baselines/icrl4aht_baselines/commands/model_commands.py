@@ -9,7 +9,6 @@ from typing import Any
 import click
 
 from icrl4aht_baselines.commands import options as shared
-from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_baselines.training.options import FILTERS, HistoryOptions
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options
@@ -90,13 +89,14 @@ def collect_command(
     """
     from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
+    from icrl4aht_baselines.agents.egos import find_agent
     from icrl4aht_baselines.online.agent_histories import collect_release, plan_swaps, release_teammates
     from icrl4aht_baselines.training.histories import filter_histories
 
     start, end = noise
     config = NoiseConfig(histories, episodes, start=(start, start), end=(end, end))
-    ego = find_ego("--agent", agent, greedy=greedy)
-    other = find_ego("--labeller", labeller, greedy=True) if labeller else None
+    ego = find_agent(agent, greedy=greedy)
+    other = find_agent(labeller, greedy=True) if labeller else None
     names = [get_layout(name).name for name in layouts] or None
     dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
     tasks = [task for manifest in manifests for task in read_tasks_and_layouts(manifest)]
@@ -150,6 +150,7 @@ def reference_command(
     with its choices. ad-rising imitates histories of rl2-reference that begin with random actions.
     """
     from icrl4aht_baselines.agents.bundled import bundle_run, check_bundle_name
+    from icrl4aht_baselines.agents.egos import find_agent
     from icrl4aht_baselines.reference import RECIPES, ReferenceMaker, check_learns_from_teacher, write_bundled_card
 
     if bundle:
@@ -162,7 +163,7 @@ def reference_command(
                 "--bundle-as: expected one --name, all tracks and an evaluation, since the card states the results"
             )
     if teacher:  # an invalid name is an error before hours of work
-        find_ego("--teacher", teacher)
+        find_agent(teacher)
         for name in names:
             check_learns_from_teacher(name)
     outcomes = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
@@ -29,7 +28,7 @@ from icrl4aht_data.commands.options import (
     Root,
     checked_later,
 )
-from icrl4aht_data.errors import EmptySelectionError, UnknownNameError
+from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.text import counted_noun
@@ -40,27 +39,8 @@ def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
     return lambda: getattr(import_module(module), name)
 
 
-def find_ego(option: str, value: str, **mode: Any) -> Any:
-    """Return the ego that an option's value names, as an `icrl4aht_baselines.agents.egos.NamedEgo`.
-
-    Args:
-        option: name of the option, for messages.
-        value: name or run folder of the ego.
-        mode: keyword arguments for `icrl4aht_baselines.agents.egos.find_agent`.
-
-    Raises:
-        click.UsageError: if the value is neither a reference ego, nor a bundled model, nor a run folder.
-    """
-    from icrl4aht_baselines.agents.egos import find_agent
-
-    try:
-        return find_agent(value, **mode)
-    except UnknownNameError as error:
-        raise click.UsageError(f"{option}: {error}") from error
-
-
 EGO_NAME = Names("agent", lambda: import_module("icrl4aht_baselines.agents.egos").agent_names(), checked_later)
-"""Name of a reference ego, or folder of a run; checked by `find_ego`."""
+"""Name of a reference ego, or folder of a run; checked by `icrl4aht_baselines.agents.egos.find_agent`."""
 TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], checked_later)
 METHOD_NAME = Names("method", lambda: import_module("icrl4aht_baselines.methods.registry").all_methods())
 PROTOCOL_NAME = Names("protocol", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "PROTOCOLS"))
@@ -123,6 +103,7 @@ def chosen_tasks(
     """Return the tasks that the values of `tasks_options` choose, from a manifest or from the package.
 
     Raises:
+        UnknownNameError: if a layout is unknown.
         EmptySelectionError: if no task has one of the chosen layouts and families.
         click.UsageError: if both a manifest and a split are given, because a manifest states the split of its tasks.
     """
@@ -133,10 +114,7 @@ def chosen_tasks(
         given = read_tasks_and_layouts(manifest)
     else:
         given = [task for of_split in split for name in track for task in bundled_tasks(name, of_split)]
-    try:
-        names = {get_layout(name).name for name in layouts}
-    except UnknownNameError as error:
-        raise click.BadParameter(str(error), param_hint="'--layout'") from error
+    names = {get_layout(name).name for name in layouts}
     chosen = [task for task in given if not names or task.layout.name in names]
     chosen = [task for task in chosen if not families or task.teammate_family in families]
     if not chosen:
@@ -144,11 +122,6 @@ def chosen_tasks(
         wanted = "".join(f" {word} {', '.join(sorted(of))}" for word, of in (("on", names), ("with", families)) if of)
         raise EmptySelectionError(f"no task{wanted} in {found}: choose another --layout or --family, or leave them out")
     return chosen
-
-
-def add_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a decorator that adds options to a command, in the order in which its help lists them."""
-    return lambda command: functools.reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
 
 manifests_option = click.option(

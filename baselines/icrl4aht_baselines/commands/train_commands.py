@@ -9,7 +9,6 @@ import click
 from icrl4aht_generation.teammates.instances import published_task
 
 from icrl4aht_baselines.commands import options as shared
-from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_baselines.methods.options import SIZES
 from icrl4aht_baselines.training.options import HistoryOptions
 from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
@@ -53,7 +52,7 @@ from icrl4aht_data.utils.text import counted_noun
     "all but the last 20 episodes, into OUT/swapped. Prints the gain by memory (M) and by knowing the partner (P).",
 )
 @shared.protocol_option
-@shared.add_options(*shared.tasks_options)
+@topic("Options", *shared.tasks_options)
 @click.option("--tasks", type=COUNT, help="At most this many tasks of each combination of layout and teammate family.")
 @click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
 @shared.suite_option
@@ -84,16 +83,17 @@ def evaluate_command(
     teammates are in neither training nor test. The split diverse has validation tasks with more diverse teammates than
     the published training ranges.
     """
-    from icrl4aht_baselines.evaluate.evaluator import evaluate, evaluate_controls
+    from icrl4aht_baselines.agents.egos import find_agent
+    from icrl4aht_baselines.evaluate.evaluator import evaluate_controls
     from icrl4aht_baselines.evaluate.protocols import CONTROLS, get_protocol, hidden_recipe_note, limit_tasks
     from icrl4aht_baselines.evaluate.rollout import Programs
     from icrl4aht_baselines.report.page import summary_lines
-    from icrl4aht_baselines.report.results import note_results, read_run
+    from icrl4aht_baselines.report.results import evaluate_agent, note_results
     from icrl4aht_baselines.report.scores import control_lines
 
     if forget and controls:
         raise click.UsageError("--controls: cannot be used with --forget, which is a control; leave out one of the two")
-    ego = find_ego("--agent", agent, acting=acting, greedy=greedy)
+    ego = find_agent(agent, acting=acting, greedy=greedy)
     chosen = limit_tasks(shared.chosen_tasks(**choice), tasks)
     if chosen_seeds:
         shared.check_conflicts("--seed", "seeds")
@@ -101,16 +101,16 @@ def evaluate_command(
     if note := hidden_recipe_note(chosen):
         click.echo(note, err=True)
     programs = Programs()
-    options: Any = {"seeds": seeds_of_tasks, "suite": suite, "out": out, "details": ego.details, "programs": programs}
+    options: Any = {"seeds": seeds_of_tasks, "suite": suite, "out": out, "programs": programs}
     lines = []
     if controls:
-        lines = control_lines(evaluate_controls(ego.name, ego.make, chosen, rules, **options), chosen)
+        played = evaluate_controls(ego.name, ego.make, chosen, rules, details=ego.details, **options)
+        lines = control_lines(played, chosen)
         for control in CONTROLS:
             note_results(out / control, ego.run, chosen)
-    else:
-        evaluate(ego.name, ego.make, chosen, rules, control="cleared" if forget else None, **options)
-    note_results(out, ego.run, chosen)
-    for line in [*summary_lines([read_run(out)]), *lines]:
+    # After controls, this only reads the results that are in `out`.
+    run = evaluate_agent(ego, chosen, rules, control="cleared" if forget else None, **options)
+    for line in [*summary_lines([run]), *lines]:
         click.echo(line)
     counted = f"{counted_noun(len(chosen), 'result')} in {out}, {counted_noun(len(programs), 'program')} compiled"
     click.echo(f"{counted}; `icrl4aht-data report {out}` shows them")
@@ -150,7 +150,7 @@ def report_command(
     paths = page.write_report(loaded, folder)
     if html:
         with progress_bars() as show:
-            paths.append(page.write_page_with_episodes(loaded, html, episodes=gifs, suite=suite, progress=show))
+            paths.append(page.write_page(loaded, html, gifs=gifs, suite=suite, progress=show))
     click.echo(paths[0].read_text(encoding="utf-8"))
     for path in paths:
         click.echo(f"wrote {path}")
@@ -176,12 +176,13 @@ def report_command(
 @overwrite_option
 def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path, overwrite: bool) -> None:
     """Play an episode and draw it as a GIF."""
+    from icrl4aht_baselines.agents.egos import find_agent
     from icrl4aht_baselines.evaluate.protocols import get_protocol
     from icrl4aht_baselines.report.gifs import save_episodes
 
     check_output(out, overwrite)
     task = published_task(layout, teammate)
-    (shown,) = save_episodes({1: out}, task, find_ego("--ego", ego).make, get_protocol(protocol), seed=seed)
+    (shown,) = save_episodes({1: out}, task, find_agent(ego).make, get_protocol(protocol), seed=seed)
     mate = f"{task.teammate_family}/t{task.teammate['theta_id']}"
     click.echo(f"{ego} with {mate}: return {shown.earned:g}; wrote {out}")
 
@@ -291,8 +292,6 @@ def demo_command(out: Path) -> None:
     teammate wants. Evaluates the model on validation tasks, also with its memory cleared before each episode. Draws the
     return in each episode, writes a report of one page, and says whether the model's memory raises the return.
     """
-    from rich.console import Console
-
     from icrl4aht_baselines.demo import run_demo
 
-    run_demo(out, Console(soft_wrap=True))
+    run_demo(out)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +22,7 @@ from icrl4aht_baselines.methods.dpt import dpt
 from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.training.options import TrainOptions
-from icrl4aht_baselines.training.trainer import StepProgress, TrainingData, TrainingTask, TrainState
+from icrl4aht_baselines.training.trainer import StepProgress, TrainingData, TrainingTask, TrainState, show_steps
 
 BANDIT_MODEL = ModelOptions(layers=2, width=32, heads=2, dropout=0.0)
 DARK_ROOM_MODEL = replace(BANDIT_MODEL, width=64, heads=4)
@@ -77,20 +76,20 @@ class ControlCheck(NamedTuple):
         return self.value <= self.limit if self.quantity.endswith("at most") else self.value >= self.limit
 
 
-ControlProgress = Callable[[str, int, int, float | None], None]
-"""Called with (name of a training run, its number of updates, updates so far, last logged loss or None)."""
+def run_control(folder: Path, show: Callable[..., None], size: ControlSize | None = None) -> list[ControlCheck]:
+    """Train and evaluate all three models, or resume a stopped run of the same size. Return the checks.
 
-
-def run_control(
-    folder: Path, size: ControlSize | None = None, done: ControlProgress = lambda name, of, step, loss: None
-) -> list[ControlCheck]:
-    """Train and evaluate all three models, or resume a stopped run of the same size. Return the checks."""
+    Args:
+        folder: folder of the training runs.
+        show: function of `progress_bars` that shows the progress of a training run.
+        size: sizes of the control; by default those of `ControlSize`.
+    """
     size = size or ControlSize()
     parts = (dpt_on_bandits, ad_on_bandits, ad_in_dark_room)
     return [
         check
         for part, updates in zip(parts, size.updates, strict=True)
-        for check in part(folder / part.__name__, size, partial(done, part.__name__, updates))
+        for check in part(folder / part.__name__, size, show_steps(show, part.__name__, updates))
     ]
 
 

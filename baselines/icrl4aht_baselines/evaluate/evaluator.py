@@ -116,8 +116,7 @@ def evaluate(
         "code_version": version("icrl4aht-data"),
     } | ({"details": details} if details else {})
     planned = plan_tasks(tasks, rules, control)
-    partners = {plan.task.task_id: plan.partners for plan in planned}
-    results = {} if out is None else find_results(out, tasks, settings, partners)
+    results = {} if out is None else find_results(out, planned, settings)
     missing = [plan for plan in planned if plan.task.task_id not in results]
     programs = Programs() if programs is None else programs
     evaluation = _Evaluation(make_ego, rules, control, seeds, suite, settings, programs)
@@ -387,15 +386,14 @@ def evaluate_controls(
     protocol: Protocol | str = "seeded",
     *,
     out: Path | None = None,
-    programs: Programs | None = None,
     **options: Any,
 ) -> ControlledResults:
     """Evaluate an ego and its controls, see `protocols.CONTROLS`.
 
     Args:
-        agent, make_ego, tasks, protocol, programs: see `evaluate`.
+        agent, make_ego, tasks, protocol: see `evaluate`.
         out: folder of the ego's results; results of the controls are in its subfolders `cleared` and `swapped`.
-        options: further arguments of `evaluate`: `seeds`, `suite` and `details`.
+        options: further arguments of `evaluate`: `seeds`, `suite`, `details` and `programs`.
 
     Raises:
         OptionError: for the reasons of `evaluate`, if the protocol swaps teammates or has fewer than 2 episodes, or if
@@ -405,7 +403,7 @@ def evaluate_controls(
     plan_tasks(tasks, rules, "swapped")  # reports a task without a partner now, not after hours
     # Only equal functions share compiled programs, and some `make_ego` return new functions in each call.
     make = make_ego if make_ego in SCRIPTED else cache(make_ego)
-    options["programs"] = Programs() if programs is None else programs
+    options = {"programs": Programs()} | options
     results = {
         control: evaluate(agent, make, tasks, rules, control=control, out=out and out / (control or ""), **options)
         for control in (None, *CONTROLS)

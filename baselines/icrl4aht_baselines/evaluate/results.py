@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from icrl4aht_baselines.evaluate.protocols import PlannedTask
 from icrl4aht_baselines.training.run_folder import check_same_settings
-from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, check_folder_content, json_hash
 
@@ -46,16 +46,13 @@ def result_path(out: Path, task_id: str) -> Path:
     return out / RESULTS / f"{task_id}.json"
 
 
-def find_results(
-    out: Path, tasks: Iterable[Task], settings: dict[str, Any], partners: Mapping[str, Sequence[str]]
-) -> dict[str, Result]:
+def find_results(out: Path, planned: Sequence[PlannedTask], settings: dict[str, Any]) -> dict[str, Result]:
     """Return task id -> stored result, for those tasks that a folder of results has.
 
     Args:
         out: folder of results.
-        tasks: tasks to find results of.
+        planned: tasks to find results of, with the partners that the results must have.
         settings: settings that the results must have.
-        partners: task id -> `Result.partners` that its result must have.
 
     Raises:
         OptionError: if a result has other settings or partners, a file is damaged, or the folder has other files and no
@@ -63,15 +60,18 @@ def find_results(
     """
     if not (out / RESULTS).is_dir():
         check_folder_content(out, (), "results of `evaluate`")
-    paths = [result_path(out, task.task_id) for task in tasks]
-    found = {result.task_id: result for result in map(read_result, filter(Path.exists, paths))}
-    for result in found.values():
-        path, expected = result_path(out, result.task_id), [*partners[result.task_id]]
+    found = {}
+    for plan in planned:
+        path = result_path(out, plan.task.task_id)
+        if not path.exists():
+            continue
+        result = read_result(path)
+        found[result.task_id] = result
         check_same_settings(result.settings, settings, f"{path}: holds a result")
-        if result.partners != expected:
+        if result.partners != [*plan.partners]:
             raise OptionError(
                 f"{path}: holds a result with the teammates of {', '.join(result.partners)}, expected those of "
-                f"{', '.join(expected)}, which follow from the tasks: give the same tasks again, or another --out"
+                f"{', '.join(plan.partners)}, which follow from the tasks: give the same tasks again, or another --out"
             )
     return found
 

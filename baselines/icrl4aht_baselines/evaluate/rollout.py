@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from threading import Lock
@@ -194,8 +193,8 @@ class Programs:
     """
 
     def __init__(self) -> None:
-        self._found: dict[Any, Future[EpisodeProgram]] = {}
-        self._lock = Lock()
+        self._found: dict[Any, EpisodeProgram] = {}
+        self._locks, self._lock = dict[Any, Lock](), Lock()
 
     def __len__(self) -> int:
         return len(self._found)
@@ -217,15 +216,12 @@ class Programs:
         shapes = tuple((np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves)
         rules = rollout.protocol.steps, rollout.protocol.four_recipes  # all other rules are in states and policies
         key = layouts, rules, *policies, structure, shapes
-        mine = Future[EpisodeProgram]()
         with self._lock:
-            found = self._found.setdefault(key, mine)
-        if found is mine:
-            try:
-                found.set_result(_compile(rollout, arguments))
-            except BaseException as error:
-                found.set_exception(error)
-        return found.result()
+            lock = self._locks.setdefault(key, Lock())
+        with lock:  # other programs can be compiled at the same time
+            if key not in self._found:
+                self._found[key] = _compile(rollout, arguments)
+            return self._found[key]
 
 
 def _compile(rollout: EvaluationRollout, arguments: tuple[Any, Any, RolloutState]) -> EpisodeProgram:

@@ -91,12 +91,10 @@ class Partner(NamedTuple):
     """Partner of a person: a policy or a second person.
 
     Attributes:
-        name: name of the partner on the command line.
         player: policy of the partner; None for a second person.
         task: published test task of the partner, if it is a test teammate; otherwise None.
     """
 
-    name: str
     player: PolicyPlayer | None
     task: Task | None = None
 
@@ -114,17 +112,17 @@ def find_partner(name: str, layout: Layout, slot: int) -> Partner:
         OptionError: if the partner cannot play on the layout.
     """
     if name == HUMAN:
-        return Partner(name, None)
+        return Partner(None)
     tests = [f"{family}/t{t}" for family in HEURISTIC_KINDS.values() for t in range(INSTANCES)]
     if name in tests:
         task = published_task(layout.name, name)
         policy = build_teammate(layout, task.teammate, slot)
-        return Partner(name, PolicyPlayer(policy, layout, slot, is_ego=False), task)
+        return Partner(PolicyPlayer(policy, layout, slot, is_ego=False), task)
     if name not in agent_names() and not Path(name).is_dir():
         raise unknown("partner", name, (HUMAN, *agent_names(), *tests))
     if slot != EGO:
         layout = _SwappedLayout(**{one.name: getattr(layout, one.name) for one in fields(Layout)})
-    return Partner(name, PolicyPlayer(find_agent(name).make(layout), layout, slot, is_ego=True))
+    return Partner(PolicyPlayer(find_agent(name).make(layout), layout, slot, is_ego=True))
 
 
 class Game:

@@ -46,8 +46,8 @@ def human_task(partner: Partner, seed: int) -> Task:
     """
     if partner.task is None:
         raise OptionError(
-            f"--record with {partner.name}: a release describes the teammate by its parameters, which only test "
-            f"teammates have: give --with H1/t0 to H4/t4, or leave --record out"
+            "--record: a release describes the teammate by its parameters, which only test teammates have: give "
+            "--with H1/t0 to H4/t4, or leave --record out"
         )
     of = partner.task
     return make_task(of.track, of.split, of.layout.name, of.teammate, FIRST_HUMAN_SEED + seed)

@@ -97,13 +97,11 @@ def _table_paths(path: Path) -> tuple[Path, Path]:
 
 
 def read_stored(path: Path) -> StoredResults:
-    """Return the results that are stored in a JSON file and in tables next to it, or empty results if it is missing.
+    """Return the results that are stored in a JSON file and in tables next to it.
 
     Raises:
-        OptionError: if a file is damaged.
+        OptionError: if a file is missing or damaged.
     """
-    if not path.is_file():
-        return StoredResults()
     table, curves = _table_paths(path)
     try:
         agents = msgspec.json.decode(path.read_bytes(), type=dict[str, AgentFacts])
@@ -173,10 +171,8 @@ def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
     """Write the page of results, its figure, and the table of results as CSV and Parquet. Return the paths.
 
     Raises:
-        OptionError: if there are no results, or pyarrow or matplotlib is not installed.
+        OptionError: if pyarrow or matplotlib is not installed.
     """
-    if not len(stored.table):
-        raise OptionError("no stored results: give files that `icrl4aht-data submit` made")
     import_pyarrow()
     folder.mkdir(parents=True, exist_ok=True)
     text, figure, csv, parquet = paths = [folder / name for name in RESULTS_FILES]
@@ -371,19 +367,15 @@ def _span(values: Sequence[int], form: str) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def figure_layouts() -> list[str]:
-    """Return the layouts that the figure shows: the first ones with headroom."""
-    cells = in_order(cell for cell, has_any in known_headroom(SUBMITTED_PROTOCOL).items() if has_any)
-    return list(dict.fromkeys(cell.layout for cell in cells))[:_PANELS]
-
-
 def plot_comparison(stored: StoredResults, path: Path) -> None:
     """Plot the agents' return in each episode on a log axis, with dashed lines for cleared memory.
 
+    The panels are of the first layouts with headroom.
     An agent without stored curves has a point at the first episode. Horizontal lines show `stay` and best responses.
     """
     scales, results, headroom = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), read_headroom(SUBMITTED_PROTOCOL)
-    layouts = figure_layouts()
+    cells = in_order(cell for cell, has_any in known_headroom(SUBMITTED_PROTOCOL).items() if has_any)
+    layouts = list(dict.fromkeys(cell.layout for cell in cells))[:_PANELS]
     figure, grid = panel_grid(layouts, 3, (3.6, 3), "episode")
     shown = [agent for agent in results if not stored.agents[agent].commit]
     curves = {

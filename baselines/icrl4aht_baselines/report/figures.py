@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrl4aht_baselines.report.results import TASK_KINDS, EvaluationRun, ResultCell, family_title, in_order, mean_of
-from icrl4aht_baselines.report.scores import cell_scales, cell_scores
+from icrl4aht_baselines.report.scores import cell_scales, find_score, scored_cells
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
@@ -30,9 +30,6 @@ _DRAWING = 1000  # units of a panel's width and height
 
 NumberedRuns = Mapping[int, EvaluationRun]
 """Number of a series, which determines its colour on the page -> run of the series."""
-
-_CellValues = Mapping[int, Mapping[ResultCell, MeanInterval]]
-"""Number of a series -> result cell -> value."""
 
 
 class Tick(NamedTuple):
@@ -137,7 +134,11 @@ def _score_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
     """Return a list with the bar chart of the agents' scores; an empty list if there are no scores."""
     scales = cell_scales(protocol)
     values = {
-        number: {cell: found for cell, found in cell_scores(run, scales).items() if cell.kind == "test"}
+        number: {
+            cell: score.total
+            for cell in scored_cells(run, run.returns, scales)
+            if cell.kind == "test" and (score := find_score(run.returns, [cell], scales))
+        }
         for number, run in runs.items()
     }
     cells = in_order(cell for of_run in values.values() for cell in of_run)
@@ -160,7 +161,7 @@ def _score_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
 def _bar_chart(
     title: str,
     runs: NumberedRuns,
-    values: _CellValues,
+    values: Mapping[int, Mapping[ResultCell, MeanInterval]],
     scale: _Scale,
     about: str,
     ranges: Mapping[ResultCell, str] = MappingProxyType({}),

@@ -20,9 +20,8 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.utils.groups import grouped
+from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.utils.system import usable_cores
-
-_PROGRESS = "episodes of the report"
 
 
 class ShownEpisode(NamedTuple):
@@ -85,10 +84,7 @@ def save_episodes(
 
 
 def family_gifs(
-    runs: Sequence[EvaluationRun],
-    folder: Path,
-    suite: Path | None = None,
-    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+    runs: Sequence[EvaluationRun], folder: Path, suite: Path | None, progress: Callable[..., None]
 ) -> list[EpisodePair]:
     """Write GIFs of the first and last episode of a task, for each agent and family of teammates.
 
@@ -109,12 +105,11 @@ def family_gifs(
         headroom = known_headroom(run.protocol)
         ordered = sorted(run.cells, key=lambda cell: (cell.order[1:], not headroom.get(cell)))
         chosen += [(run, cells[0]) for cells in grouped(ordered, lambda cell: cell[1:]).values()]
-    progress(_PROGRESS, 0, len(chosen))
+    advance = counted(progress, "episodes of the report", len(chosen))
     with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes most of the time
         drawn = [pool.submit(_draw_result, *each, folder / str(number), suite) for number, each in enumerate(chosen)]
-        for done, future in enumerate(as_completed(drawn), start=1):
-            future.result()
-            progress(_PROGRESS, done, len(chosen))
+        for _ in as_completed(drawn):
+            advance(1)
     return [future.result() for future in drawn]
 
 

@@ -45,7 +45,6 @@ from icrl4aht_baselines.report.scores import (
 from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend, overlap_marks
 from icrl4aht_data.benchmark.facts import TRACKS, family_order
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text
 from icrl4aht_data.utils.templates import card_file, markdown_table
 from icrl4aht_data.utils.text import counted_noun
@@ -289,55 +288,33 @@ def csv_text(runs: Sequence[EvaluationRun]) -> str:
 
 
 def write_page(
-    runs: Sequence[EvaluationRun], path: Path, episodes: Sequence[EpisodePair] = (), notes: Sequence[str] = ()
+    runs: Sequence[EvaluationRun],
+    path: Path,
+    *,
+    gifs: bool = False,
+    suite: Path | None = None,
+    progress: Callable[..., None] = lambda what, done, total: None,
 ) -> Path:
     """Write the HTML page of a report. Return the path of the page.
 
     Args:
         runs: merged results of agents, see `results.merge`, under any protocols.
-        path: path of the page, which ends in .html; an existing file is replaced atomically.
-        episodes: episodes to show, see `gifs.family_gifs`.
-        notes: notes for the reader, such as the names of runs without episodes.
-
-    Raises:
-        OptionError: if the path does not end in .html, or `runs` is empty.
+        path: path of the page; an existing file is replaced atomically.
+        gifs: whether the page has GIFs of episodes of at most three runs, of other agents before reference egos.
+        suite: folder of learned teammates' checkpoints.
+        progress: function for progress, called with (description, tasks drawn, number of tasks).
     """
-    if path.suffix not in (".html", ".htm"):
-        raise OptionError(f"{path}: expected a name that ends in .html")
-    if not runs:
-        raise OptionError("no run to report; give at least one folder of results")
-    text = _environment().get_template("page.html").render(_page_values(runs, episodes, notes))
+    shown = sorted(runs, key=lambda run: run.agent in AGENTS)[:_RUNS_WITH_EPISODES] if gifs else []
+    left = [run.label for run in runs if run not in shown]
+    notes = [f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}"]
+    with TemporaryDirectory() as folder:
+        episodes = family_gifs(shown, Path(folder), suite, progress)
+        values = _page_values(runs, episodes, notes if shown and left else [])
+        text = _environment().get_template("page.html").render(values)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")
     return path
-
-
-def write_page_with_episodes(
-    runs: Sequence[EvaluationRun],
-    path: Path,
-    *,
-    episodes: bool = True,
-    suite: Path | None = None,
-    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
-) -> Path:
-    """Write the HTML page of a report, with GIFs of episodes of at most three runs. Return the path of the page.
-
-    Other agents are chosen before reference egos.
-
-    Args:
-        runs, path: see `write_page`.
-        episodes: whether the page has GIFs of episodes.
-        suite: folder of learned teammates' checkpoints.
-        progress: function for progress, called with (description, tasks drawn, number of tasks).
-    """
-    shown = sorted(runs, key=lambda run: run.agent in AGENTS)[:_RUNS_WITH_EPISODES] if episodes else []
-    left = [run.label for run in runs if run not in shown]
-    notes = []
-    if shown and left:
-        notes.append(f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}")
-    with TemporaryDirectory() as folder:
-        return write_page(runs, path, family_gifs(shown, Path(folder), suite, progress), notes)
 
 
 @cache

@@ -28,7 +28,7 @@ import pandas as pd
 
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo
 from icrl4aht_baselines.evaluate.evaluator import evaluate
-from icrl4aht_baselines.evaluate.protocols import Protocol, bundled_tasks
+from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, Protocol, bundled_tasks
 from icrl4aht_baselines.evaluate.results import RESULTS, Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_baselines.training.seen import TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on, sorted_overlaps
@@ -263,15 +263,10 @@ def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] =
         run: run folder of the evaluated model, or None. Its path, settings, their hash and the hash of the data's
             manifest are written to run.json.
         tasks: evaluated tasks; those that are not published test tasks are added to tasks.jsonl.
-
-    Raises:
-        OptionError: if `run` is not a run on learning histories.
     """
     results.mkdir(parents=True, exist_ok=True)
     if run is not None:
         config = read_config(run)
-        if "histories" not in config:
-            raise OptionError(f"{run}: its config.json has no `histories`: expected a run that trained on histories")
         content = {
             "run": str(run.resolve()),
             "run_hash": json_hash(config),
@@ -317,8 +312,8 @@ def evaluate_agent(
     return read_run(out)
 
 
-def read_results(folder: Path) -> tuple[list[Result], dict[str, Any] | None]:
-    """Return the results in a folder that `icrl4aht-data evaluate` made, and the content of run.json or None.
+def read_results(folder: Path) -> list[Result]:
+    """Return the results in a folder that `icrl4aht-data evaluate` made.
 
     Raises:
         OptionError: if the folder has no results.
@@ -326,8 +321,7 @@ def read_results(folder: Path) -> tuple[list[Result], dict[str, Any] | None]:
     results = [read_result(path) for path in sorted((folder / RESULTS).glob("*.json"))]
     if not results:
         raise OptionError(f"{folder}: no results in {folder / RESULTS}; run `icrl4aht-data evaluate --out {folder}`")
-    path = folder / TRAINED_RUN
-    return results, parse_json(read_text(path)) if path.exists() else None
+    return results
 
 
 def read_run(folder: Path) -> EvaluationRun:
@@ -336,9 +330,9 @@ def read_run(folder: Path) -> EvaluationRun:
     Raises:
         OptionError: if the folder has no results, the results have different settings, or a task is unknown.
     """
-    results, trained = read_results(folder)
     own = read_tasks_and_layouts(folder / OWN_TASKS) if (folder / OWN_TASKS).exists() else []
-    return as_run(results, str(folder), own, trained)
+    trained = parse_json(read_text(folder / TRAINED_RUN)) if (folder / TRAINED_RUN).exists() else None
+    return as_run(read_results(folder), str(folder), own, trained)
 
 
 def as_run(
@@ -358,16 +352,15 @@ def as_run(
     settings = results[0].settings
     if any(result.settings != settings for result in results):
         raise OptionError(f"{where}: expected results with equal settings, found different settings; evaluate again")
-    known = bundled_by_id("test") | {task.task_id: task for task in tasks}
-    if any(result.task_id not in known for result in results):
-        known = bundled_by_id("validation") | bundled_by_id("diverse") | known
+    known = {key: task for split in EVALUATION_SPLITS for key, task in bundled_by_id(split).items()}
+    known |= {task.task_id: task for task in tasks}
     if missing := [result.task_id for result in results if result.task_id not in known]:
         raise OptionError(
             f"{where}: {missing[0]!r} is neither a published test task, nor a validation task of this package, nor in "
             f"the results' {OWN_TASKS}; evaluate again, or copy the manifest of the tasks to {OWN_TASKS}"
         )
     played = grouped(results, lambda result: cell_of(known[result.task_id]))
-    seen = find_seen(settings, trained, where)
+    seen = find_seen(settings, where)
     agent, seeds = (settings["agent"], settings["protocol"]["name"]), settings["seeds"]
     rows, cells, tracks = [], {}, defaultdict(dict)
     for cell in in_order(played):
@@ -386,20 +379,18 @@ def as_run(
     return EvaluationRun(*agent, pd.DataFrame(rows, columns=TABLE_COLUMNS), cells, sources=sources)
 
 
-def find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: str) -> dict[str, SeenInTraining | None]:
+def find_seen(settings: dict[str, Any], where: str) -> dict[str, SeenInTraining | None]:
     """Return track -> layouts and teammates in an agent's training; None if the results do not state them.
 
     The only key is empty, unless the agent has a separate model for each track. Reference egos have an empty record.
     """
     details = settings.get("details", {})
-    for record in (details, (trained or {}).get("config", {})):
-        entries = record.get(TRAINED_ON)
-        if isinstance(entries, dict) and entries.keys() <= TRACKS.keys():
-            return {track: read_trained_on(entries[track], where) if track in entries else None for track in TRACKS}
-        if TRAINED_ON in record:
-            return {"": read_trained_on(entries, where)}
-    untrained = settings["agent"] in AGENTS and not details and trained is None
-    return {"": SeenInTraining() if untrained else None}
+    if TRAINED_ON not in details:
+        return {"": SeenInTraining() if settings["agent"] in AGENTS and not details else None}
+    entries = details[TRAINED_ON]
+    if isinstance(entries, dict) and entries.keys() <= TRACKS.keys():
+        return {track: read_trained_on(entries[track], where) if track in entries else None for track in TRACKS}
+    return {"": read_trained_on(entries, where)}
 
 
 def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:

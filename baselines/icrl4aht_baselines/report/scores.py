@@ -189,8 +189,8 @@ def find_score(returns: AgentReturns, cells: Sequence[ResultCell], scales: CellS
     groups: dict[str, list[Stratum]] = defaultdict(list)
     values, labels, regrets = [], [], []
     for cell in cells:
-        gains, spans, names, stratum = _gains_and_scales(returns[cell], scales[cell])
-        groups[cell.layout].append(stratum)
+        gains, spans, names = _gains_and_scales(returns[cell], scales[cell])
+        groups[cell.layout].append(behaviour_stratum(gains, spans, names))
         regrets.append(spans - gains.mean(axis=(0, 2)))
         for name in dict.fromkeys(names):
             own = [number for number, other in enumerate(names) if other == name]
@@ -211,13 +211,12 @@ def is_scored(returns: CellReturns | None, scale: CellScale | None) -> bool:
     return bool(returns and scale and scale.has_headroom and scale.tasks.keys() <= {*returns.tasks})
 
 
-def _gains_and_scales(returns: CellReturns, scale: CellScale) -> tuple[np.ndarray, np.ndarray, list[str], Stratum]:
-    """Return R - S (T, U, S), B - S (U,), behaviours, and stratum of the tasks that have best responses."""
+def _gains_and_scales(returns: CellReturns, scale: CellScale) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return R - S (T, U, S), B - S (U,), and the behaviours in the tasks that have best responses."""
     known = [number for number, task in enumerate(returns.tasks) if task in scale.tasks]
     of_task = [scale.tasks[returns.tasks[number]] for number in known]
     stays, bests = (np.array([getattr(one, name) for one in of_task]) for name in ("stay", "best"))
-    gains, names = returns.blocks["all"][:, known] - stays[:, None], [one.behaviour for one in of_task]
-    return gains, bests - stays, names, behaviour_stratum(gains, bests - stays, names)
+    return returns.blocks["all"][:, known] - stays[:, None], bests - stays, [one.behaviour for one in of_task]
 
 
 def behaviour_stratum(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
@@ -241,9 +240,8 @@ def score_difference(
     """Return the score of one agent minus that of another, paired by task, seed and number of the training."""
     groups: dict[str, list[Stratum]] = defaultdict(list)
     for cell in cells:
-        pair = paired(one[cell], other[cell])
-        gains, spans, names, _ = _gains_and_scales(pair[0], scales[cell])
-        groups[cell.layout].append(behaviour_stratum(gains - _gains_and_scales(pair[1], scales[cell])[0], spans, names))
+        first, second = (_gains_and_scales(of, scales[cell]) for of in paired(one[cell], other[cell]))
+        groups[cell.layout].append(behaviour_stratum(first[0] - second[0], *first[1:]))
     return ratio_interval([*groups.values()])
 
 
@@ -273,29 +271,21 @@ def block_difference(
 
 def paired(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:
     """Return two agents' results in a cell, reduced to common tasks, seeds and training runs in the same order."""
-    axes = [(of.trainings, of.tasks, of.seeds) for of in (one, other)]
-    common = [tuple(key for key in first if key in second) for first, second in zip(*axes, strict=True)]
+    common: dict[str, Any] = {
+        axis: tuple(key for key in getattr(one, axis) if key in getattr(other, axis))
+        for axis in ("trainings", "tasks", "seeds")
+    }
 
-    def select_common(found: CellReturns, own: tuple[tuple[Any, ...], ...]) -> CellReturns:
-        places = np.ix_(*([axis.index(key) for key in keys] for axis, keys in zip(own, common, strict=True)))
-        blocks = {name: values[places] for name, values in found.blocks.items()}
-        trainings, tasks, seeds = common
-        return CellReturns(tasks, seeds, blocks, found.overlaps, trainings)
+    def select_common(of: CellReturns) -> CellReturns:
+        places = np.ix_(*([getattr(of, axis).index(key) for key in keys] for axis, keys in common.items()))
+        return of._replace(blocks={name: values[places] for name, values in of.blocks.items()}, **common)
 
-    return select_common(one, axes[0]), select_common(other, axes[1])
+    return select_common(one), select_common(other)
 
 
 def scored_cells(run: EvaluationRun, cells: Iterable[ResultCell], scales: CellScales) -> list[ResultCell]:
     """Return the cells with headroom that a run played completely, with episodes of the benchmark's length."""
     return [cell for cell in cells if run.has_full_length(cell) and is_scored(run.returns[cell], scales.get(cell))]
-
-
-def cell_scores(run: EvaluationRun, scales: CellScales) -> dict[ResultCell, MeanInterval]:
-    """Return result cell -> score N, for the cells that `scored_cells` returns."""
-    return {
-        cell: ratio_interval([[_gains_and_scales(run.returns[cell], scales[cell])[-1]]])
-        for cell in scored_cells(run, run.returns, scales)
-    }
 
 
 def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str]:
@@ -309,15 +299,12 @@ def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str
         tasks: evaluated tasks, in the order of the results.
     """
     alike, last, lines = behaviour_names(), counted_noun(results.last, "last episode"), []
-    names = [alike.get(task_label(task.task_id), task.task_id) for task in tasks]
-    cells = pd.DataFrame([(task.track, task.layout.name, task.teammate_family) for task in tasks])
-    for track, of_track in cells.groupby(0, sort=False):
+    names = np.array([alike.get(task_label(task.task_id), task.task_id) for task in tasks])
+    for track, of_track in grouped(range(len(tasks)), lambda row: tasks[row].track).items():
+        cells = grouped(of_track, lambda row: (tasks[row].layout.name, tasks[row].teammate_family)).values()
         texts = []
         for values in (results.memory, results.partner):
-            strata = [
-                behaviour_stratum(values[None, own.index], np.ones(len(own)), [names[row] for row in own.index])
-                for _, own in of_track.groupby([1, 2], sort=False)
-            ]
+            strata = [behaviour_stratum(values[None, own], np.ones(len(own)), names[own].tolist()) for own in cells]
             texts.append(ratio_interval([[stratum] for stratum in strata]).text(sign="+"))
         memory, partner = texts
         lines += [

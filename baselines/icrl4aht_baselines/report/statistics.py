@@ -28,7 +28,7 @@ class MeanInterval(NamedTuple):
     """Mean or ratio with its 95 % interval.
 
     Attributes:
-        mean: estimated mean or ratio; NaN without values.
+        mean: estimated mean or ratio.
         low: lower end of the interval; NaN with too few units to resample.
         high: upper end of the interval; NaN with too few units to resample.
         p: two-sided p-value of the hypothesis that the true value is 0; NaN without an interval.
@@ -80,11 +80,9 @@ def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMP
     """Return the mean over groups of the ratio sum(gains) / sum(scales), with its 95 % interval.
 
     Args:
-        groups: strata of each group; all strata have the same training runs.
+        groups: strata of each group, at least one; all strata have the same training runs.
         resamples: number of resamples.
     """
-    if not groups:
-        return MeanInterval(float("nan"))
     strata = [[Stratum(gains[None], scales[None]) for gains, scales in group] for group in groups]
     trainings = groups[0][0].gains.shape[0]
     (mean,), (variance,) = _estimate(strata, np.full((1, trainings), 1 / trainings))
@@ -101,8 +99,6 @@ def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMP
         studentised = (means - mean) / np.sqrt(variances)
     studentised = studentised[np.isfinite(studentised)]
     error = float(np.sqrt(variance))
-    if not len(studentised):
-        return MeanInterval(float(mean))
     low, high = mean - error * np.quantile(studentised, (0.975, 0.025))
     p = (1 + np.sum(np.abs(studentised) >= abs(mean) / error)) / (1 + len(studentised))
     return MeanInterval(float(mean), float(low), float(high), float(p))
@@ -142,7 +138,7 @@ def _estimate(groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R
 
 def interquartile_mean(values: Float[np.ndarray, " U"]) -> MeanInterval:
     """Return the interquartile mean of values, with its BCa bootstrap interval (Agarwal et al. 2021)."""
-    mean = float(trim_mean(values, 0.25)) if len(values) else float("nan")
+    mean = float(trim_mean(values, 0.25))
     if len(values) <= _LEAST_FREEDOM:
         return MeanInterval(mean)
     jackknife = [trim_mean(np.delete(values, number), 0.25) for number in range(len(values))]

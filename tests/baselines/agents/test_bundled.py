@@ -13,7 +13,6 @@ import pytest
 from icrl4aht_baselines.agents import bundled
 from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
 from icrl4aht_baselines.agents.egos import find_agent
-from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.report.comparison import describe_scores, read_stored, results_file
 from icrl4aht_baselines.training.histories import prepare, read_trained
@@ -70,9 +69,8 @@ def test_model_bundled_as_sampled_samples_its_actions_by_default(trained_run, tm
     by_default, greedy = find_agent("ad-drawn"), find_agent("ad-drawn", greedy=True)
     assert by_default.name == "ad-drawn" and by_default.details and by_default.details["sampled"] is True
     assert greedy.name == "ad-drawn (greedy)" and greedy.details and "sampled" not in greedy.details
-    assert find_ego("--agent", "ad-drawn", acting="exact", greedy=None).name == "ad-drawn"
-    assert find_ego("--agent", "ad-drawn", greedy=True).name == "ad-drawn (greedy)"
-    assert find_ego("--agent", str(trained_run), greedy=False).name == "AD+mlp (sampled)"
+    assert find_agent("ad-drawn", acting="exact", greedy=None).name == "ad-drawn"
+    assert find_agent(str(trained_run), greedy=False).name == "AD+mlp (sampled)"
     assert run_cli("models").endswith("(source noise), draws its actions\n")
     with pytest.raises(UnknownNameError, match=r"unknown acting 'exat'.*Did you mean 'exact'"):
         find_agent(trained_run, acting="exat")  # type: ignore[arg-type]

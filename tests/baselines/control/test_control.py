@@ -51,7 +51,7 @@ def test_source_algorithms_improve_within_a_history():
 @pytest.mark.parametrize(("quantity", "code"), [("regret, at most", 0), ("regret, at least", 1)])
 def test_control_command_exits_with_1_if_a_check_fails(tmp_path, monkeypatch, quantity, code):
     check = control.ControlCheck("bandits", "AD", quantity, 1.0, 2.0, "")
-    monkeypatch.setattr(control, "run_control", lambda folder, done: [check])
+    monkeypatch.setattr(control, "run_control", lambda folder, show: [check])
     printed = run_cli("control", "--out", tmp_path, code=code)
     assert ("FAIL" in printed) == bool(code)
 
@@ -59,7 +59,7 @@ def test_control_command_exits_with_1_if_a_check_fails(tmp_path, monkeypatch, qu
 @pytest.mark.slow
 def test_control_trains_all_models_and_fails_if_they_are_undertrained(tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "can_draw", lambda: False)
-    monkeypatch.setattr(control.run_control, "__defaults__", (TINY, lambda name, total, step, loss: None))
+    monkeypatch.setattr(control.run_control, "__defaults__", (TINY,))
     printed = run_cli("control", "--out", tmp_path, code=1)
     assert printed.count("FAIL") >= 2
     # In only four steps, a model without context cannot have twice the regret of the source algorithm.

@@ -251,9 +251,7 @@ def test_next_segment_starts_with_its_own_recipes():
 
 
 def test_evaluate_command_with_controls_writes_all_results(compiled_programs, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "icrl4aht_baselines.commands.train_commands.find_ego", lambda option, name, **mode: NamedEgo(name, ego(PAID))
-    )
+    monkeypatch.setattr("icrl4aht_baselines.agents.egos.find_agent", lambda name, **mode: NamedEgo(name, ego(PAID)))
     monkeypatch.setattr("icrl4aht_baselines.evaluate.evaluator.Programs", lambda: compiled_programs)
     write_tasks(tmp_path / "two.jsonl", TASKS)
 

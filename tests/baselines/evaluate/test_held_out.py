@@ -88,5 +88,5 @@ def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, 
     other = shutil.copytree(trained, tmp_path / "other")
     (other / "config.json").write_text(json.dumps(config | {"package_version": "0.0.0"}))
     (results / "run.json").write_text(json.dumps(about | {"run": str(other)}))
-    (pair,) = family_gifs([read_run(results)], tmp_path, suite)
+    (pair,) = family_gifs([read_run(results)], tmp_path, suite, lambda *shown: None)
     assert pair.episodes == () and pair.caption.startswith(f"No picture: {other} holds another model: expected")

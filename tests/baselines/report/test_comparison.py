@@ -113,7 +113,7 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
     text = paths[0].read_text(encoding="utf-8")
     assert "| `high` | noise | oracle | 10 updates, 2 core-hours | – |" in text and "| `low`" not in text
     assert "These models were trained with earlier code: `low`." in text and "None measured (version" in text
-    assert paths[1].stat().st_size > 10_000 and len(comparison.figure_layouts()) == 6
+    assert paths[1].stat().st_size > 10_000
     assert len(pd.read_parquet(paths[3])) == len(stored.table)
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: response_files / "measured.json")
     table = add_scales(stored.table)
@@ -122,13 +122,12 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
     mixed = table[table["control"] == "swapped"]
     assert set(mixed.loc[mixed["best"].notna(), "block"]) == {"last 20"}, "others have another teammate"
     assert "20 of 32 cells" in comparison.render_comparison(some)
-    with pytest.raises(OptionError, match="no stored results: give files that"):
-        comparison.write_comparison(StoredResults(), tmp_path / "empty")
 
 
 @pytest.mark.parametrize("texts", ["{", "[]", '{"a": {}}', "{}"])
 def test_damaged_stored_results_raise_error(texts, tmp_path):
-    assert len(comparison.read_stored(tmp_path / "none.json").table) == 0
+    with pytest.raises(OptionError, match=r"none\.json: not stored results: FileNotFoundError.*restore it"):
+        comparison.read_stored(tmp_path / "none.json")
     (tmp_path / "bad.json").write_text(texts)
     (tmp_path / "bad.csv").write_text("agent,protocol\n")
     with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*restore it, bad\.csv\.gz and bad_curves"):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icrl4aht_baselines.report import page
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode
-from icrl4aht_baselines.report.page import write_page
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, ResultCell
 from PIL import Image
 
@@ -33,15 +33,17 @@ def report_file(tmp_path_factory) -> Path:
     shown = tuple(ShownEpisode(number, 20.0 * number, folder / "a.gif") for number in (1, 100))
     caption = "Task 0123456789abcdef, protocol published"
     pairs = [EpisodePair(ResultCell("demo_wide", "H1"), "AD with H1/t0 on demo_wide", caption, shown)]
-    write_page(runs, folder / "report.html", pairs, ["left out: runs/" + "y" * 60])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, "family_gifs", lambda *options: pairs)
+        page.write_page(runs, folder / "report.html", gifs=True)
     return folder / "report.html"
 
 
 @pytest.mark.parametrize("dark", [False, True])
 def test_report_fits_the_width_of_a_phone(report_file, dark):
     with chromium() as open_page:
-        page = open_page(report_file.as_uri(), PHONE, dark)
-        page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true })")
-        assert page.locator("section").count() == 6
-        assert page.evaluate(TOO_WIDE, PHONE) == []
-        check_fits_phone(page, dark)
+        shown = open_page(report_file.as_uri(), PHONE, dark)
+        shown.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true })")
+        assert shown.locator("section").count() == 6
+        assert shown.evaluate(TOO_WIDE, PHONE) == []
+        check_fits_phone(shown, dark)

@@ -13,10 +13,10 @@ from icrl4aht_baselines.agents.bundled import MODELS
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.headroom import write_headroom_cards
 from icrl4aht_baselines.reference import training_sentence
-from icrl4aht_baselines.report import gifs, merge
+from icrl4aht_baselines.report import gifs, merge, page
 from icrl4aht_baselines.report.figures import bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode, restore_ego
-from icrl4aht_baselines.report.page import markdown, write_page, write_page_with_episodes
+from icrl4aht_baselines.report.page import markdown, write_page
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, ResultCell
 
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -53,7 +53,7 @@ class PageElements(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_html_report_is_complete_and_loads_no_external_files(tmp_path):
+def test_html_report_is_complete_and_loads_no_external_files(tmp_path, monkeypatch):
     runs = [evaluated_run(name, TEST_LAYOUTS, protocol="published") for name in ("AD", "random")]
     runs.append(evaluated_run("AD", protocol="published", note="K250"))
     (tmp_path / "a.gif").write_bytes(GIF)
@@ -62,19 +62,22 @@ def test_html_report_is_complete_and_loads_no_external_files(tmp_path):
         EpisodePair(ResultCell("demo_wide", "H1"), "H1 & an ego", "task 1", shown),
         EpisodePair(ResultCell("demo_wide", "rl"), "an ego", "No picture: <its run> is gone"),
     ]
-    text = write_page(runs, tmp_path / "r" / "report.html", episodes, ["left out: <nothing>"]).read_text()
+    monkeypatch.setattr(page, "family_gifs", lambda *options: episodes)
+    runs.append(evaluated_run("stay", protocol="published", note="<left out>"))
+    text = write_page(runs, tmp_path / "r" / "report.html", gifs=True).read_text()
     found = PageElements(text)
     assert (found.outside, found.open, found.images) == ([], [], ["data:image/gif"] * 2)
     for section in ("summary", "curves", "episodes", "tables", "settings", "paper"):
         assert f'<section id="{section}">' in text and f'href="#{section}"' in text
-    parts = ["left out: &lt;nothing&gt;", "H1 &amp; an ego", "Episode 2: return 40", "&lt;its run&gt; is gone"]
+    parts = [
+        "there is none of: stay [&lt;left out&gt;]",
+        "H1 &amp; an ego",
+        "Episode 2: return 40",
+        "&lt;its run&gt; is gone",
+    ]
     parts += ["paper 12.5 ± 11.3", "AD [K250]", 'name="viewport"', "prefers-color-scheme: dark"]
     assert [part for part in parts if part not in text] == []
     assert text.count("<table") == text.count("<caption>") and "url(" not in text and "@import" not in text
-    with pytest.raises(OptionError, match=r"report\.txt: expected a name that ends in \.html"):
-        write_page(runs, tmp_path / "report.txt")
-    with pytest.raises(OptionError, match="no run to report"):
-        write_page([], tmp_path / "report.html")
 
 
 def test_html_in_names_is_escaped_in_all_reports(tmp_path):
@@ -182,13 +185,13 @@ def test_shown_episodes_are_of_tasks_with_headroom(invented_responses, tmp_path,
     runs = [fake_run("stay"), fake_run("oracle"), fake_run("AD"), fake_run("AD", note="K250"), fake_run("DPT")]
     drawn: list[tuple[int, int]] = []
     path = tmp_path / "report.html"
-    text = write_page_with_episodes(runs, path, progress=lambda what, *counts: drawn.append(counts)).read_text()
+    text = write_page(runs, path, gifs=True, progress=lambda what, *counts: drawn.append(counts)).read_text()
     assert drawn == [(done, 6) for done in range(7)]
     found = re.findall(r"<h4>([^<]+? with \S+ on \S+)</h4>", text)
     agents = ("AD", "AD [K250]", "DPT")
     assert found == [f"{agent} with {mate} on demo_wide" for mate in ("H1/t0", "H4/t0") for agent in agents]
     assert "episodes are of 3 runs at most; there is none of: stay, oracle" in text
-    assert 'id="episodes"' not in write_page_with_episodes(runs, path, episodes=False).read_text()
+    assert 'id="episodes"' not in write_page(runs, path).read_text()
 
 
 def test_restoring_an_unknown_or_missing_ego_raises_error(tmp_path):

@@ -56,18 +56,18 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c, one, task: c.update(agent="search"), "search has the name of a reference ego; give another --name"),
-        (lambda c, one, task: c.update(agent="ad-rising"), "ad-rising has the name of a bundled model; give another"),
-        (lambda c, one, task: c.update(agent="rule (greedy)"), "ends with a play mode"),
+        (lambda c, one, task: c.update(agent="search"), "search names a reference ego or a bundled model; give"),
+        (lambda c, one, task: c.update(agent="ad-rising"), "ad-rising names a reference ego or a bundled"),
+        (lambda c, one, task: c.update(agent="rule (greedy)"), "without a play mode at its end"),
         (lambda c, one, task: c.update(agent="a | b"), "not a file of results: .*matching regex"),
         (lambda c, one, task: c.update(best_responses="99"), r"best responses of version '99', expected '0'"),
         (lambda c, one, task: one["settings"]["details"].clear(), "no declaration of the training data"),
         (lambda c, one, task: one["settings"]["protocol"].update(four_recipes=True), "'four_recipes': True"),
         (lambda c, one, task: one.update(control="swap"), "control 'swap', expected cleared or swapped"),
-        (lambda c, one, task: c["evaluations"].append(one), "two results of a task"),
-        (lambda c, one, task: one["returns"].pop(task), "1 of the 40 test tasks of layout are missing, such as layout"),
-        (lambda c, one, task: rename_task(one, task, OTHER), f"task {OTHER} is not one of the 40 test tasks of layout"),
-        (lambda c, one, task: c.update(tracks=["teammate"]), "is not one of the 120 test tasks of teammate"),
+        (lambda c, one, task: c["evaluations"].append(one), "of the 40 test tasks of layout and no others, found 2 of"),
+        (lambda c, one, task: one["returns"].pop(task), "found 0 of layout_test_.*1 wrong task"),
+        (lambda c, one, task: rename_task(one, task, OTHER), "found 0 of layout_test_.*2 wrong tasks"),
+        (lambda c, one, task: c.update(tracks=["teammate"]), "the 120 test tasks of teammate and no others"),
         (lambda c, one, task: one["settings"].update(seeds=[0, 1]), r"seeds \[0, 1\], expected \[0, 1, 2\]"),
         (lambda c, one, task: one["returns"][task].pop(), r"has 2 lists of \[100\] returns, expected 3 of 100"),
         (lambda c, one, task: one["settings"]["protocol"].update(name="published"), "protocol {'name': 'published'"),
@@ -102,6 +102,7 @@ def test_results_that_cannot_be_submitted_raise_errors(tmp_path):
 
 def test_submit_and_results_commands_write_file_and_page(submission_file, tmp_path, monkeypatch):
     monkeypatch.setattr(comparison, "results_file", lambda: tmp_path / "stored.json")
+    comparison.write_stored(tmp_path / "stored.json", comparison.StoredResults())
     folder = str(write_results(tmp_path / "mine", "mine", CURVE))
     said = ["--about", "a rule", "--data", "none", "--labels", "none", "--core-hours", "1.5", "--name", "my rule"]
     printed = run_cli("submit", folder, *said, "--out", tmp_path / "mine.json")
