@@ -34,7 +34,7 @@ from icrl4aht_data.errors import OfflineError, OptionError, RemoteError, RootNot
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.manifest import check_against_manifest, parse_manifest, read_manifest
+from icrl4aht_data.format.manifest import check_against_manifest, read_manifest
 from icrl4aht_data.format.schema import INDEX_FILES, MANIFEST, PARQUET_EPISODES
 from icrl4aht_data.utils import files as disk
 from icrl4aht_data.utils.progress import counted, progress_bars
@@ -107,14 +107,12 @@ class Remote(ReleaseLocation):
         folder: the release's folder on this machine.
         url: address of the release, with its revision if it has one, without credentials.
         revision: the Hub's commit, or the first 16 hexadecimal digits of the manifest's SHA-256.
-        manifest: file -> SHA-256, hexadecimal.
         client: client that downloads files.
         in_hub_cache: whether `folder` belongs to the Hub's cache.
     """
 
     url: str
     revision: str
-    manifest: dict[str, str]
     client: HubClient | FsspecClient
     in_hub_cache: bool = False
 
@@ -216,6 +214,11 @@ class Remote(ReleaseLocation):
             return dict(zip(names, with_retries(self.url, lambda: self.client.sizes(names)), strict=True))
 
     @cached_property
+    def manifest(self) -> dict[str, str]:
+        """SHA-256 of each file, hexadecimal, by path in the release."""
+        return dict(read_manifest(self.folder))  # a dict can be pickled
+
+    @cached_property
     def _shard_sizes(self) -> dict[str, int]:
         return read_info(self.folder).shards
 
@@ -304,8 +307,7 @@ def _open_hub(url: str, to: Path | None) -> Remote:
     url = f"hf://datasets/{match['repo']}@{commit}"
     if to is not None:
         _prepare_folder(to, text, url)
-    client, manifest = HubClient(match["repo"], commit), _parse_manifest(text, url)
-    return Remote(to or path.parent, url, commit, manifest, client, in_hub_cache=to is None)
+    return Remote(to or path.parent, url, commit, HubClient(match["repo"], commit), in_hub_cache=to is None)
 
 
 def _open_address(address: str, to: Path | None) -> Remote:
@@ -323,11 +325,11 @@ def _open_address(address: str, to: Path | None) -> Remote:
             _, text = _fetch_manifest(client, url, Path(scratch))
         if to is None:
             (base / disk.short_hash(text)).mkdir(parents=True, exist_ok=True)
-            with disk.process_lock(disk.lock_path(latest)), disk.atomic_write(latest) as partial:
-                partial.write_text(disk.short_hash(text))
+            with disk.process_lock(disk.lock_path(latest)):
+                disk.write_atomically(latest, disk.short_hash(text))
     folder = to or base / disk.short_hash(text)
     _prepare_folder(folder, text, url, is_ours=to is None)
-    return Remote(folder, url, disk.short_hash(text), _parse_manifest(text, url), client)
+    return Remote(folder, url, disk.short_hash(text), client)
 
 
 def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | None) -> tuple[Path, bytes]:
@@ -346,11 +348,6 @@ def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | 
     return path, path.read_bytes()
 
 
-def _parse_manifest(text: bytes, url: str) -> dict[str, str]:
-    # Bytes that are not UTF-8 become unprintable characters, which `parse_manifest` refuses.
-    return dict(parse_manifest(text.decode(errors="surrogateescape"), f"{url}/{MANIFEST}"))
-
-
 def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) -> None:
     """Create the folder for a release's files, and write the manifest into it.
 
@@ -367,13 +364,10 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
     with disk.process_lock(disk.lock_path(folder)):  # another process may be writing the manifest
         if has_manifest():
             return
-        if path.exists() and not is_ours:
-            raise OptionError(f"{folder}: contains a release that differs from {url}; give another folder")
         if folder.exists() and any(folder.iterdir()) and not is_ours:
-            raise OptionError(f"{folder}: not empty, and not a release; give a new or an empty folder")
+            raise OptionError(f"{folder}: not empty, and not a download of {url}; give a new or an empty folder")
         folder.mkdir(parents=True, exist_ok=True)
-        with disk.atomic_write(path) as partial:
-            partial.write_bytes(text)
+        disk.write_atomically(path, text)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import draw_frame, encode_episode
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import start_record
-from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.files import atomic_write, write_atomically
 from icrl4aht_data.utils.install_hints import import_optional, install_command
 from icrl4aht_data.utils.text import counted_histories
 
@@ -82,8 +82,7 @@ class Picture:
             save_figure(self._content, target)
             return
         _check_suffix(target, (".gif",))
-        with atomic_write(target) as partial:
-            partial.write_bytes(self._content)
+        write_atomically(target, self._content)
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.files import write_atomically
 from icrl4aht_data.utils.install_hints import RESTORE
 from icrl4aht_data.utils.templates import card_file
 
@@ -131,5 +131,4 @@ def write_best_responses(path: Path, card: BestResponseCard) -> None:
             seed["return"] = round(seed["return"], 3)
     lines = ",\n  ".join(msgspec.json.encode(behaviour).decode() for behaviour in content.pop("behaviours"))
     head = msgspec.json.format(msgspec.json.encode(content), indent=1).decode().removesuffix("\n}")
-    with atomic_write(path) as partial:
-        partial.write_text(f'{head},\n "behaviours": [' + (f"\n  {lines}\n ]" if lines else "]") + "\n}\n", "utf-8")
+    write_atomically(path, f'{head},\n "behaviours": [' + (f"\n  {lines}\n ]" if lines else "]") + "\n}\n")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import zlib
+from base64 import b64encode
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -27,7 +27,7 @@ from icrl4aht_data.overcooked.drawing import AGENT_COLOURS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import faults
 from icrl4aht_data.reading.history import History
-from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.files import write_atomically
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_histories
 
@@ -206,12 +206,12 @@ def make_browser_page(
 
 def save_browser_page(page: BrowserPage, path: Path) -> None:
     """Write an HTML page to a file atomically."""
-    with atomic_write(path) as partial:
-        partial.write_bytes(page.html)
+    write_atomically(path, page.html)
 
 
 def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
-    name, info = _release_name(dataset), dataset.info
+    info, origin = dataset.info, dataset.origin
+    name = str(origin) if isinstance(origin, Remote) else dataset.root.resolve().name  # a name without local folders
     by_layout = grouped(embedded, lambda one: one.facts["layout"])
     index = {
         "release": {"name": name, "kind": info.kind, "version": info.data_version, "histories": info.histories},
@@ -225,7 +225,7 @@ def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
         "histories": [one.facts | {"teammate": _teammate_label(dataset, one.facts["history_id"])} for one in embedded],
     }
     packed = zlib.compress(json.dumps(index, separators=(",", ":")).encode(), 9)
-    data = {"index": _to_base64(packed), "histories": [_to_base64(one.data) for one in embedded]}
+    data = {"index": b64encode(packed).decode(), "histories": [b64encode(one.data).decode() for one in embedded]}
     text = Template(page_source("page.html")).substitute(
         release=escape(name),
         style=page_style(),
@@ -242,11 +242,6 @@ def _teammate_label(dataset: Dataset, history_id: int) -> str:
     return f"{name} t{dataset.recover_teammate(history_id)['theta_id']}" if dataset.has_tasks else name
 
 
-def _release_name(dataset: Dataset) -> str:
-    """Return the address of a remote release, or the name of a local folder without its path."""
-    return str(dataset.origin) if isinstance(dataset.origin, Remote) else dataset.root.resolve().name
-
-
 def page_style() -> str:
     """Return the CSS style sheet of a page, with the colours of the agents as variables."""
     colours = {"ego": AGENT_COLOURS[EGO], "teammate": AGENT_COLOURS[TEAMMATE]}
@@ -257,7 +252,3 @@ def page_style() -> str:
 def page_source(name: str) -> str:
     """Return the text of one of the files that a page is made of, such as `state.js`."""
     return (_FILES / name).read_text(encoding="utf-8")
-
-
-def _to_base64(content: bytes) -> str:
-    return base64.b64encode(content).decode()

@@ -12,9 +12,8 @@ from icrl4aht_data.fetch import ReleaseLocation, Remote
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.manifest import META_FILE
 from icrl4aht_data.format.provenance import ProvenanceByTask
-from icrl4aht_data.format.schema import EXPERTS, INFO, MANIFEST, PROVENANCE, TEAMMATES
+from icrl4aht_data.format.schema import EXPERTS, INDEX_FILES, INFO, MANIFEST, PROVENANCE, TEAMMATES
 from icrl4aht_data.utils.files import LARGEST, file_hash, files_below, resolve_inside
 
 _HUB_FILES = (".gitattributes", ".cache/huggingface/")
@@ -49,13 +48,11 @@ def check_files(
         try:
             path = resolve_inside(root, name)
             size, right = path.stat().st_size, sizes.get(name)
-            if right is None and size > LARGEST:
-                report.add(name, f"expected at most {LARGEST:,} bytes, found {size:,}")
+            if size > LARGEST if right is None else size != right:
+                expected_size = f"at most {LARGEST:,}" if right is None else f"{right:,}"
+                report.add(name, f"expected {expected_size} bytes, found {size:,}")
                 continue
-            if right is not None and size != right:
-                report.add(name, f"expected {right:,} bytes, found {size:,}")
-                continue
-            found = listed[name] if quick and not META_FILE.fullmatch(name) else file_hash(path)
+            found = listed[name] if quick and name not in INDEX_FILES else file_hash(path)
         except (Icrl4ahtError, OSError) as error:
             report.add(name, str(error))
             continue

@@ -24,11 +24,9 @@ from icrl4aht_data.utils.plugins import Plugins
 
 _REMEDIES = {
     errno.ENOENT: "check the path; a new file's folder has to exist",
-    errno.ENOTDIR: "expected a folder, found a file: give another folder",
-    errno.EEXIST: "expected a folder, found a file: give another folder",
+    **dict.fromkeys((errno.ENOTDIR, errno.EEXIST), "expected a folder, found a file: give another folder"),
     errno.EISDIR: "expected a file, found a folder: give another name",
-    errno.EACCES: "give a folder that you may write to, and files that you may read",
-    errno.EPERM: "give a folder that you may write to, and files that you may read",
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "give a folder that you may write to, and files that you may read"),
     errno.EROFS: "give a folder that can be written to",
     errno.EFBIG: "a limit on the size of files is set, see `ulimit -f`",
     **dict.fromkeys(FULL, "free some space, or give a folder on another disk"),

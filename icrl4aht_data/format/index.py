@@ -27,10 +27,10 @@ from icrl4aht_data.errors import (
     check_choice,
 )
 from icrl4aht_data.format.info import ReleaseInfo, read_info
-from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_layouts_stored, read_layouts
+from icrl4aht_data.format.layouts_file import PUBLISHED, check_layouts_stored, layout_family, read_layouts
 from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, HISTORIES, INFO, KINDS, TEXTS, Entry, as_json, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
-from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.layouts import Layout, add_layouts, get_layout
 from icrl4aht_data.utils.files import read_lines, resolve_inside
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.options import check_int
@@ -149,8 +149,6 @@ def _check_entry(entry: Entry, number: int, checked: set[tuple[Any, ...]]) -> No
         raise IndexFormatError(f"expected history_id {number}, since ids count up from 0, found {entry.history_id}")
     if entry.action_dim != len(ACTIONS):
         raise IndexFormatError(f"expected action_dim {len(ACTIONS)}, found {entry.action_dim}")
-    if entry.episodes > entry.T:
-        raise IndexFormatError(f"expected at most one episode per step, found {entry.episodes} in {entry.T} steps")
     key = *_names(entry), entry.obs_shape
     if key in checked:
         return
@@ -183,13 +181,18 @@ class Index:
         root: the release folder.
         info: content of meta/info.json.
         entries: entries of the histories; a history's id is its position in this sequence.
-        layouts: the layouts that the release stores because the benchmark does not have them.
+        layouts: the layouts that the release stores because the benchmark does not have them, by name.
     """
 
     root: Path
     info: ReleaseInfo
     entries: Columns
-    layouts: ReleaseLayouts
+    layouts: dict[str, Layout]
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # A process that unpickles a dataset has not read the release, so `get_layout` does not know the layouts yet.
+        self.__dict__.update(state)
+        add_layouts(self.layouts.values())
 
     def __repr__(self) -> str:
         return f"Index({counted_histories(len(self.entries))} at {self.root})"
@@ -242,7 +245,7 @@ class Index:
 
     def _family_layouts(self, families: Iterable[str]) -> list[str]:
         """Return the layouts of the release that belong to any of the families."""
-        by_family = {PUBLISHED: []} | grouped(self.values("layout"), self.layouts.family)
+        by_family = {PUBLISHED: []} | grouped(self.values("layout"), layout_family)
         for family in families:
             check_choice(LAYOUT_FAMILY, family, by_family)
         return [layout for family in families for layout in by_family[family]]
@@ -257,13 +260,11 @@ class Index:
         """
         if name == "layout":
             return get_layout(str(value)).name
-        if value in (own := [one for one in self.values(name) if one]):
-            return value  # saves time, since `check_family` searches the installed packages
         if name == "teammate_family":
             check_family(value)
         else:
             known = {"split": SPLITS, "track": ALL_TRACKS, "source": SOURCES, "label_view": LABEL_VIEWS}.get(name, ())
-            check_choice(given, value, (*known, *own))
+            check_choice(given, value, (*known, *filter(None, self.values(name))))
         return value
 
 
@@ -285,6 +286,12 @@ def read_index(root: Path) -> Index:
         raise IndexFormatError(
             f"{path}, line {without[0] + 1}: expected has_teammate_actions true in a {info.kind} release"
         )
+    steps, episodes, kept = entries.column("T"), entries.column("episodes"), info.environment.kept_steps
+    # Only histories of releases without states may end within an episode.
+    wrong = np.flatnonzero((steps // kept != episodes) | ((steps % kept > 0) & (info.kind in KINDS)))
+    if len(wrong):
+        found = f"found {episodes[wrong[0]]} episodes in {steps[wrong[0]]} steps"
+        raise IndexFormatError(f"{path}, line {wrong[0] + 1}: expected episodes of {kept} steps as in {INFO}, {found}")
     check_layouts_stored(entries.values("layout"), layouts, path)
-    check_layouts_stored((get_layout(task.layout).name for task in info.left_out), layouts, root / INFO)
+    check_layouts_stored((task.layout for task in info.left_out), layouts, root / INFO)
     return Index(root, info, entries, layouts)

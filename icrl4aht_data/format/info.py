@@ -24,7 +24,6 @@ from icrl4aht_data.errors import (
     OptionError,
     RootNotFoundError,
 )
-from icrl4aht_data.format.layouts_file import read_layouts
 from icrl4aht_data.format.provenance import ProvenanceByTask
 from icrl4aht_data.format.schema import INFO, READABLE_VERSIONS, Entry, FiniteNumber, Kind, StreamCount, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
@@ -192,8 +191,7 @@ class ReleaseInfo:
             info = msgspec.convert(content, cls)
             check_version(info.data_version)  # a bad version would end up in tags and folder names
             for task in info.left_out:
-                get_layout(task.layout)
-                for text in (task.task_id, task.teammate, task.source, task.reason):
+                for text in (task.task_id, task.layout, task.teammate, task.source, task.reason):
                     check_name(text)
         except (msgspec.ValidationError, Icrl4ahtError) as error:
             raise IndexFormatError(str(error)) from error
@@ -214,7 +212,6 @@ def read_info(root: Path) -> ReleaseInfo:
             f"{root}: no release here, expected {INFO} in it; give the folder of a release, fetch one with "
             f"`icrl4aht-data download`, or give no folder for the bundled release"
         )
-    read_layouts(root)  # left-out tasks may have layouts that only this release stores
     try:
         content = parse_json(read_text(path))
         version = content.get("format_version") if isinstance(content, dict) else None

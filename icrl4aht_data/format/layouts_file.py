@@ -9,11 +9,8 @@ Reading a release makes its layouts available to `get_layout` by name.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Container, Iterable
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -36,30 +33,13 @@ OTHER = "other"
 _GENERATED = re.compile(r"(\w+)-(\d+)-(\d+)", re.ASCII).fullmatch
 
 
-@dataclass(frozen=True)
-class ReleaseLayouts:
-    """Layouts stored in a release because the benchmark does not have them.
-
-    Args:
-        families: family of each layout, by the layout's name.
-        layouts: the layouts, in the order of the file.
-    """
-
-    families: dict[str, str]
-    layouts: tuple[Layout, ...] = ()
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        # A process that unpickles a dataset has not read the release, so `get_layout` does not know the layouts yet.
-        self.__dict__.update(state)
-        add_layouts(self.layouts)
-
-    def family(self, layout: str) -> str:
-        """Return the family of a layout of the release."""
-        return PUBLISHED if layout in LAYOUTS else self.families.get(layout, OTHER)
+def layout_family(name: str) -> str:
+    """Return the family of a layout: `PUBLISHED`, the family in the name of a generated layout, or `OTHER`."""
+    return PUBLISHED if name in LAYOUTS else _origin(name)[0]
 
 
-def read_layouts(root: Path) -> ReleaseLayouts:
-    """Read the layouts stored in a release, and make the layouts available to `get_layout`.
+def read_layouts(root: Path) -> dict[str, Layout]:
+    """Return the layouts stored in a release by name, and make the layouts available to `get_layout`.
 
     Raises:
         IndexFormatError: if a line is malformed, if a name occurs twice or already belongs to another map, if a recipe
@@ -69,25 +49,22 @@ def read_layouts(root: Path) -> ReleaseLayouts:
     return _read_layouts_file(resolve_inside(root, LAYOUTS_FILE))
 
 
-def _read_layouts_file(path: Path) -> ReleaseLayouts:
+def _read_layouts_file(path: Path) -> dict[str, Layout]:
     """Return the layouts of a file, see `read_layouts`; no layouts if the file does not exist."""
-    families: dict[str, str] = {}
-    layouts = []
+    layouts: dict[str, Layout] = {}
     for number, line in enumerate(read_lines(path) if path.is_file() else (), start=1):
         try:
-            layout, family = _parse_line(line)
-            if layout.name in families:
+            layout = _parse_line(line)
+            if layout.name in layouts:
                 raise IndexFormatError(f"layout {layout.name!r} is listed twice; remove one of the lines")
-            families[layout.name] = family
-            layouts += add_layouts([layout])
+            (layouts[layout.name],) = add_layouts([layout])
         except (msgspec.MsgspecError, Icrl4ahtError) as error:
             raise IndexFormatError(f"{path}, line {number}: {error}") from error
-    return ReleaseLayouts(families, tuple(layouts))
+    return layouts
 
 
-@lru_cache(maxsize=1024)  # saves 0.5 ms per line, since opening a release parses each line twice
-def _parse_line(line: str) -> tuple[Layout, str]:
-    """Return the layout that a line describes, and the layout's family; see `read_layouts` for the errors."""
+def _parse_line(line: str) -> Layout:
+    """Return the layout that a line describes; see `read_layouts` for the errors."""
     fields = msgspec.json.decode(line, type=LayoutLine)
     check_name(fields.name)
     check_name(fields.family)
@@ -97,7 +74,7 @@ def _parse_line(line: str) -> tuple[Layout, str]:
             f"layout {fields.name!r}: expected family, seed and number {expected} for this name, found {found}"
         )
     check_solvable(layout)
-    return layout, fields.family
+    return layout
 
 
 def read_tasks_and_layouts(path: Path) -> list[Task]:
@@ -139,12 +116,12 @@ def _origin(name: str) -> tuple[str, int | None, int | None]:
     return (OTHER, None, None) if generated is None else (generated[1], int(generated[2]), int(generated[3]))
 
 
-def check_layouts_stored(names: Iterable[str], layouts: ReleaseLayouts, path: Path) -> None:
+def check_layouts_stored(names: Iterable[str], stored: Container[str], path: Path) -> None:
     """Check that each layout of an index belongs to the benchmark or is stored in the release.
 
     Raises:
         IndexFormatError: if a layout is neither, even if an opened release or an installed package has the layout.
     """
     for name in names:
-        if name not in LAYOUTS and name not in layouts.families:
+        if name not in LAYOUTS and name not in stored:
             raise IndexFormatError(f"{path}: layout {name!r} is neither published nor in {LAYOUTS_FILE}; add it there")

@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 from icrl4aht_data.errors import ChunkTableError, IndexFormatError, UnsafePathError
 from icrl4aht_data.format.schema import EXPERTS, INDEX_FILES, MANIFEST, PARQUET_EPISODES, PARQUET_INDEX, TEAMMATES
-from icrl4aht_data.utils.files import atomic_write, checked_hash, file_hash, is_safe_path, read_text, resolve_inside
+from icrl4aht_data.utils.files import checked_hash, file_hash, is_safe_path, read_text, resolve_inside, write_atomically
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
@@ -34,12 +34,6 @@ _KNOWN = re.compile(
 )
 """Pattern of the paths that a release may contain. All other paths are rejected, because other programs could run the
 content of a downloaded file such as .git/config, sitecustomize.py or x.pth."""
-
-
-META_FILE = re.compile(r"meta/[^/]+")
-"""Pattern of the files in meta/, except chunk tables. Opening a release checks their hashes."""
-
-_SOURCE_CARD = "meta/source_card.md"  # written only by earlier versions of this package
 
 
 @lru_cache(maxsize=16)
@@ -118,15 +112,9 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
 
 
 def check_meta(root: Path) -> None:
-    """Check the files in meta/, except chunk tables, with `check_against_manifest`.
-
-    meta/source_card.md, which earlier versions of this package wrote, may be missing, since no code reads this file.
-    """
-    names = {name for name in read_manifest(root) if META_FILE.fullmatch(name)}
-    if not (root / _SOURCE_CARD).exists():
-        names.discard(_SOURCE_CARD)
-    names |= {name for name in INDEX_FILES if (root / name).exists()}
-    check_against_manifest(root, sorted(names))
+    """Check those of `INDEX_FILES` that are listed or present with `check_against_manifest`."""
+    listed = read_manifest(root)
+    check_against_manifest(root, sorted(name for name in INDEX_FILES if name in listed or (root / name).exists()))
 
 
 def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
@@ -145,5 +133,4 @@ def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
     if foreign:
         raise UnsafePathError(f"{root}: {foreign[0]!r} is not a file that a release may contain; remove it")
     lines = [f"{known.get(name) or file_hash(root / name)}  {name}\n" for name in names if name != MANIFEST]
-    with atomic_write(root / MANIFEST) as partial:
-        partial.write_text("".join(lines), encoding="utf-8")
+    write_atomically(root / MANIFEST, "".join(lines))

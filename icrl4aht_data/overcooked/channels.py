@@ -13,36 +13,21 @@ from typing import Literal
 import numpy as np
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.overcooked.cells import CANONICAL_TYPES, FACINGS, WINDOW
+from icrl4aht_data.overcooked.cells import CANONICAL_TYPES, WINDOW
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.tables import Array
+from icrl4aht_data.overcooked.tables import Array, packed_channels
 
 Channels = Literal["own", "canonical"]
 CHANNELS: tuple[Channels, ...] = ("own", "canonical")
 """Sets of observation channels: "own" differs between layouts, "canonical" is the same for all layouts."""
 
-
-def _names(ingredient_types: int, delivery: bool) -> tuple[str, ...]:
-    def item(owner: str) -> list[str]:
-        return [f"{owner}_{what}" for what in ("plate", "cooked", *ingredients)]
-
-    def agent(owner: str) -> list[str]:
-        return [f"{owner}_position", *(f"{owner}_facing_{facing}" for facing in FACINGS), *item(owner)]
-
-    ingredients = [f"ingredient_{number}" for number in range(ingredient_types)]
-    static = ["wall", "goal", "pot", "recipe_indicator", "button", "plate_pile"]
-    piles = [f"pile_{number}" for number in range(ingredient_types)]
-    last = ["pot_timer", "delivery"] if delivery else ["pot_timer"]
-    return (*agent("self"), *agent("other"), *static, *piles, *item("item"), *item("recipe"), *last)
-
-
-CANONICAL_CHANNELS: tuple[str, ...] = _names(CANONICAL_TYPES, True)
+CANONICAL_CHANNELS: tuple[str, ...] = tuple(packed_channels(CANONICAL_TYPES, True))
 """Names of the 46 canonical channels, in order, for four ingredient types and the delivery indicator."""
 
 
 def channel_names(layout: Layout) -> tuple[str, ...]:
     """Return the names of a layout's C own channels, in order; the docstring of `observe` explains the channels."""
-    return _names(layout.ingredient_types, layout.indicates_delivery)
+    return tuple(packed_channels(layout.ingredient_types, layout.indicates_delivery, layout))
 
 
 @lru_cache(maxsize=64)

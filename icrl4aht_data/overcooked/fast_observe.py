@@ -203,6 +203,5 @@ def _index_of(values: np.ndarray) -> np.ndarray:
     return lookup
 
 
-@lru_cache(maxsize=256)  # up to 4 MB per renderer; a batch can mix many of a release's hundreds of layouts
-def _renderer(layout: Layout, dtype: str, canonical: bool) -> _Renderer:
-    return _Renderer(layout, dtype, canonical)
+# Up to 4 MB per renderer; a batch can mix many of a release's hundreds of layouts.
+_renderer = lru_cache(maxsize=256)(_Renderer)

@@ -7,7 +7,7 @@ a digit = ingredient pile, a space = floor. Source: paper, App. A.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from operator import attrgetter
@@ -72,38 +72,33 @@ class Layout:
     def __post_init__(self) -> None:
         for name, kind in _type_hints(Layout).items():
             object.__setattr__(self, name, convert_option(f"layout {self.name}: {name}", getattr(self, name), kind))
-        if fault := self._map_fault() or self._recipe_fault():
+        for fault in self._faults():
             raise OptionError(f"layout {self.name}: {fault}")
 
-    def _map_fault(self) -> str | None:
-        """Return what is wrong with the map, or None."""
+    def _faults(self) -> Iterator[str]:
+        """Yield what is wrong with the map and the recipes; each check needs the ones before it to succeed."""
         if len({len(row) for row in self.rows}) != 1:
-            return f"the rows have widths {[len(row) for row in self.rows]}, expected equal widths"
+            yield f"the rows have widths {[len(row) for row in self.rows]}, expected equal widths"
         wrong = {c for row in self.rows for c in row if c not in _LETTERS and c not in digits}
         if wrong:
-            return f"unknown map letters {sorted(wrong)}"
+            yield f"unknown map letters {sorted(wrong)}"
         if len(self.agent_cells) != 2:
-            return f"the map has {len(self.agent_cells)} agents 'A', expected 2"
+            yield f"the map has {len(self.agent_cells)} agents 'A', expected 2"
         if self.cells > NOWHERE - 1 or len(self.ingredients) > 3:
-            return (
+            yield (
                 f"the map has {self.cells} cells and piles of {len(self.ingredients)} ingredient types; "
                 f"a state record holds at most {NOWHERE - 1} cells and 3 types"
             )
         for cell in self.walkable.nonzero()[0]:
             x, y = cell % self.width, cell // self.width
             if x in (0, self.width - 1) or y in (0, self.height - 1):
-                return f"an agent can reach the map's edge at ({x}, {y})"
-        return None
-
-    def _recipe_fault(self) -> str | None:
-        """Return what is wrong with the recipes, or None."""
+                yield f"an agent can reach the map's edge at ({x}, {y})"
         missing = {i for recipe in self.recipes for i in recipe} - set(self.ingredients)
         if missing:
-            return f"recipes use ingredients {sorted(missing)} that have no pile"
+            yield f"recipes use ingredients {sorted(missing)} that have no pile"
         # A recipe listed in two orders of its ingredients would be drawn twice as often.
         if not self.recipes or len({tuple(sorted(recipe)) for recipe in self.recipes}) < len(self.recipes):
-            return f"expected at least one recipe, and no recipe twice, found {list(self.recipes)}"
-        return None
+            yield f"expected at least one recipe, and no recipe twice, found {list(self.recipes)}"
 
     @property
     def width(self) -> int:

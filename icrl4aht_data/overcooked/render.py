@@ -19,7 +19,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.drawing import FOOTER, INK, PAPER, VIEW, Canvas, cell_centre, state_parts
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import faults, record_size
-from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.files import write_atomically
 from icrl4aht_data.utils.install_hints import import_optional
 from icrl4aht_data.utils.options import check_int
 
@@ -67,9 +67,7 @@ def save_episode(
         path: path of the GIF file.
         layout, records, rewards, cell, fps: arguments of `encode_episode`, which raises the same errors.
     """
-    content = encode_episode(layout, records, rewards, cell=cell, fps=fps)
-    with atomic_write(Path(path)) as partial:
-        partial.write_bytes(content)
+    write_atomically(Path(path), encode_episode(layout, records, rewards, cell=cell, fps=fps))
 
 
 def encode_episode(

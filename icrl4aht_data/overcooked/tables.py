@@ -20,6 +20,7 @@ from icrl4aht_data.overcooked.cells import (
     BUTTON,
     CANONICAL_TYPES,
     CENTRE,
+    FACINGS,
     GOAL,
     INDICATOR,
     NOWHERE,
@@ -44,7 +45,7 @@ SEARCH_ORDER = (RIGHT, DOWN, LEFT, UP)
 # Bits of the second word, the agents: self 0..12 (position 1 bit, facing 4, hand 8), other agent 13..25.
 TIMER_BIT, RECIPE_BIT, DELIVERY_BIT, FIXED_BIT, _PILES = 8, 13, 19, 20, 26
 AGENT_BITS, CELL_BIT = 13, 20
-_STATIC = (WALL, GOAL, POT, INDICATOR, BUTTON, PLATES)
+_KINDS = {"wall": WALL, "goal": GOAL, "pot": POT, "recipe_indicator": INDICATOR, "button": BUTTON, "plate_pile": PLATES}
 
 
 class ChannelBits(NamedTuple):
@@ -269,7 +270,7 @@ def _view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.nda
     changing = np.select([layout.kinds == kind for kind in words], list(words.values()), 0)
     changing[list(layout.counters)] = 3 + pots + buttons + np.arange(len(layout.counters))
     fixed = np.zeros(layout.cells, np.int32)
-    for bit, kind in enumerate(_STATIC):
+    for bit, kind in enumerate(_KINDS.values()):
         fixed |= (layout.kinds == kind) << bit
     for bit, ingredient in enumerate(layout.ingredients):
         pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
@@ -279,28 +280,45 @@ def _view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.nda
     return np.where(layout.window >= 0, packed[layout.window], NOWHERE << CELL_BIT).astype(np.int32)
 
 
+def packed_channels(types: int, delivery: bool, layout: Layout | None = None) -> dict[str, tuple[int, int]]:
+    """Return the lowest bit and the bits of each observation channel in a visible cell's two packed words.
+
+    Args:
+        types: number of ingredient types.
+        delivery: whether there is a delivery channel.
+        layout: the layout; None if only the names of the channels are needed.
+
+    Returns:
+        Channel name -> (lowest bit, bits), in the order of the channels; no bits for channels that are always 0.
+    """
+    order = {ingredient: number for number, ingredient in enumerate(layout.ingredients if layout else ())}
+
+    def by_type(name: str, first: int, width: int, mask: int) -> dict[str, tuple[int, int]]:
+        return {f"{name}_{i}": (first + width * order[i], mask) if i in order else (0, 0) for i in range(types)}
+
+    def item(owner: str, first: int) -> dict[str, tuple[int, int]]:
+        flags = {f"{owner}_plate": (first, 1), f"{owner}_cooked": (first + 1, 1)}
+        return flags | by_type(f"{owner}_ingredient", first + 2, 2, 3)
+
+    def agent(owner: str, first: int) -> dict[str, tuple[int, int]]:
+        facings = {f"{owner}_facing_{facing}": (first + 1 + number, 1) for number, facing in enumerate(FACINGS)}
+        return {f"{owner}_position": (first, 1)} | facings | item(owner, first + 5)
+
+    return {
+        **agent("self", 0),
+        **agent("other", AGENT_BITS),
+        **{name: (FIXED_BIT + bit, 1) for bit, name in enumerate(_KINDS)},
+        **by_type("pile", _PILES, 1, 1),
+        **item("item", 0),
+        **dict.fromkeys(("recipe_plate", "recipe_cooked"), (0, 0)),
+        **by_type("recipe_ingredient", RECIPE_BIT, 2, 3),
+        "pot_timer": (TIMER_BIT, 31),
+        **({"delivery": (DELIVERY_BIT, int(layout is not None and layout.indicates_delivery))} if delivery else {}),
+    }
+
+
 def _channel_bits(layout: Layout, types: int, delivery: bool) -> ChannelBits:
     """Return the bits of the channels for `types` ingredient types, with or without delivery; empty for 0 types."""
-    order = {ingredient: number for number, ingredient in enumerate(layout.ingredients)}
-
-    def by_type(first: int, width: int, mask: int) -> list[tuple[int, int]]:
-        return [(first + width * order[i], mask) if i in order else (0, 0) for i in range(types)]
-
-    def item(first: int) -> list[tuple[int, int]]:
-        return [(first, 1), (first + 1, 1), *by_type(first + 2, 2, 3)]
-
-    agent = [(0, 1), *((1 + facing, 1) for facing in range(4)), *item(5)]
-    bits = [
-        *agent,
-        *((AGENT_BITS + shift if mask else 0, mask) for shift, mask in agent),
-        *((FIXED_BIT + bit, 1) for bit in range(len(_STATIC))),
-        *by_type(_PILES, 1, 1),
-        *item(0),
-        (0, 0),  # a recipe never sets the channels plate and cooked
-        (0, 0),
-        *by_type(RECIPE_BIT, 2, 3),
-        (TIMER_BIT, 31),
-        *([(DELIVERY_BIT, int(layout.indicates_delivery))] if delivery else []),
-    ]
-    shift, mask = np.array(bits if types else bits[:0], np.uint32).reshape(-1, 2).T
-    return ChannelBits(shift, mask, np.arange(len(shift)) < 2 * len(agent))
+    channels = packed_channels(types, delivery, layout) if types else {}
+    shift, mask = np.array(list(channels.values()), np.uint32).reshape(-1, 2).T
+    return ChannelBits(shift, mask, np.array([name.startswith(("self", "other")) for name in channels], bool))

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.schema import ACTION_FIELDS, ENCODED, ENTRY_HINTS, FIELDS, TEXTS
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
@@ -83,18 +82,10 @@ def episode_table(history: History, schema: pa.Schema) -> pa.Table:
     Args:
         history: a history of a release with state records; all of its arrays are read.
         schema: the `episode_schema` of a selection that contains the history.
-
-    Raises:
-        IndexFormatError: if the history does not consist of episodes of the schema's number of steps.
     """
     arrow, entry = import_pyarrow(), history.entry
     count, steps = entry.episodes, schema.field("state").type.list_size
     width = schema.field("episode_end_state").type.list_size
-    if count * steps != entry.T:
-        raise IndexFormatError(
-            f"{entry.shard}: history {entry.history_id}: expected {count} episodes of {steps} steps, found {entry.T} "
-            f"steps; check the release with `icrl4aht-data verify`"
-        )
     values: dict[str, Any] = {"episode": np.arange(count), "rewards": history.read("rewards")}
     values["return"] = values["rewards"].reshape(count, steps).sum(axis=1)
     for name in ACTION_FIELDS:

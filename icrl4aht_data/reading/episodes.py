@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Self, overload
 
 import numpy as np
 
+from icrl4aht_data.format.schema import FIELDS
 from icrl4aht_data.utils.options import check_position, take_slice
 
 if TYPE_CHECKING:
@@ -19,67 +20,59 @@ class FieldArrays:
     T is the number of steps, E the number of episodes.
     """
 
+    obs: np.ndarray
+    """Observations, float32 or uint8 (T, 5, 5, C); with obs="state", state records, uint8 (T, S).
+
+    With channels="canonical", C is 46 on every layout.
+    """
+
+    state: np.ndarray
+    """State record before each step, uint8 (T, S); see `overcooked.state`."""
+
+    actions: np.ndarray
+    """The ego's actions, int32 (T,), from 0 to 5."""
+
+    rewards: np.ndarray
+    """The team's reward for each step, without shaping, float32 (T,)."""
+
+    dones: np.ndarray
+    """True at the last kept step of each episode, bool (T,)."""
+
+    teammate_actions: np.ndarray
+    """The teammate's actions, int32 (T,), from 0 to 5."""
+
+    expert_actions: np.ndarray
+    """Greedy actions of the expert policy at each step, int32 (T,), from 0 to 5.
+
+    The expert policy is the learner's last checkpoint, as in the paper (App. D.1), or an earlier checkpoint with a
+    higher return; see `entry.expert_step` and `entry.expert_return`.
+    """
+
+    oracle_actions: np.ndarray
+    """Actions of the scripted oracle, which knows the full state, at each step, int32 (T,), from 0 to 5.
+
+    In a history of source "noise", oracle actions are the ego's actions without the noise. They equal
+    `expert_actions`, so a release need not store both.
+    """
+
+    episode_end_state: np.ndarray
+    """State record after the last kept step of each episode, uint8 (E, S); of a single episode, uint8 (S,)."""
+
     def __getitem__(self, name: str) -> np.ndarray:
         raise NotImplementedError
 
     __iter__ = None
     """Disabled, since Python would otherwise iterate over items 0, 1, .., which do not exist."""
 
-    @property
-    def obs(self) -> np.ndarray:
-        """Observations, float32 or uint8 (T, 5, 5, C); with obs="state", state records, uint8 (T, S).
+    if not TYPE_CHECKING:  # type checkers would accept any name
 
-        With channels="canonical", C is 46 on every layout.
-        """
-        return self["obs"]
+        def __getattr__(self, name: str) -> np.ndarray:
+            if name in FIELDS:
+                return self[name]
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
-    @property
-    def state(self) -> np.ndarray:
-        """State record before each step, uint8 (T, S); see `overcooked.state`."""
-        return self["state"]
-
-    @property
-    def actions(self) -> np.ndarray:
-        """The ego's actions, int32 (T,), from 0 to 5."""
-        return self["actions"]
-
-    @property
-    def rewards(self) -> np.ndarray:
-        """The team's reward for each step, without shaping, float32 (T,)."""
-        return self["rewards"]
-
-    @property
-    def dones(self) -> np.ndarray:
-        """True at the last kept step of each episode, bool (T,)."""
-        return self["dones"]
-
-    @property
-    def teammate_actions(self) -> np.ndarray:
-        """The teammate's actions, int32 (T,), from 0 to 5."""
-        return self["teammate_actions"]
-
-    @property
-    def expert_actions(self) -> np.ndarray:
-        """Greedy actions of the expert policy at each step, int32 (T,), from 0 to 5.
-
-        The expert policy is the learner's last checkpoint, as in the paper (App. D.1), or an earlier checkpoint with a
-        higher return; see `entry.expert_step` and `entry.expert_return`.
-        """
-        return self["expert_actions"]
-
-    @property
-    def oracle_actions(self) -> np.ndarray:
-        """Actions of the scripted oracle, which knows the full state, at each step, int32 (T,), from 0 to 5.
-
-        In a history of source "noise", oracle actions are the ego's actions without the noise. They equal
-        `expert_actions`, so a release need not store both.
-        """
-        return self["oracle_actions"]
-
-    @property
-    def episode_end_state(self) -> np.ndarray:
-        """State record after the last kept step of each episode, uint8 (E, S); of a single episode, uint8 (S,)."""
-        return self["episode_end_state"]
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *FIELDS]
 
 
 class Episode(FieldArrays):

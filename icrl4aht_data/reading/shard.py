@@ -114,27 +114,19 @@ class Shard:
         *firsts, total = np.cumsum([0, *chunks]).tolist()
         found = int(np.count_nonzero(table["rows"]))
         if found != total or not table["rows"][:total].all():
-            raise ShardMismatchError(
-                f"{self.path}: the index implies {total} chunks, the chunk table has {found}; "
-                f"fetch meta/ and the shard again"
-            )
+            raise self._mismatch(f"the index implies {total} chunks, the chunk table has {found}")
         sums = np.add.reduceat(table["rows"][:total].astype(np.int64), firsts).tolist()
         sizes = []
         for (entry, field), first, rows in zip(self.datasets, firsts, sums, strict=True):
             self._first[entry.history_id, field.name] = first
             if rows != entry.rows(field):
-                raise ShardMismatchError(
-                    f"{self.path}: history {entry.history_id}: the index says {entry.rows(field)} rows of "
-                    f"{field.name}, the chunk table says {rows}; fetch meta/ and the shard again"
-                )
+                where = f"history {entry.history_id}: the index says {entry.rows(field)} rows of {field.name}"
+                raise self._mismatch(f"{where}, the chunk table says {rows}")
             sizes.append(self._chunk_rows(entry.history_id, field) * self._elements[field.name].itemsize)
         raw, stored = np.repeat(sizes, chunks), table["size"][:total].astype(np.int64)
         wrong = np.flatnonzero((stored > raw + raw // 1000 + 64) | (raw > DEFLATE_RATIO * stored))
         if len(wrong):
-            raise ShardMismatchError(
-                f"{self.path}: {self.describe(int(wrong[0]))} cannot be decompressed to {raw[wrong[0]]} bytes; "
-                f"fetch meta/ and the shard again"
-            )
+            raise self._mismatch(f"{self.describe(int(wrong[0]))} cannot be decompressed to {raw[wrong[0]]} bytes")
 
     def _check_size(self) -> None:
         """Check that the file contains every chunk of the table."""
@@ -144,13 +136,16 @@ class Shard:
             raise self._read_error(error) from error
         offset, length = self.table["offset"], self.table["size"]
         if int(length.sum(dtype=np.int64)) > size >= int((offset + length).max(initial=0)):
-            raise ShardMismatchError(f"{self.path}: some of its {size} bytes belong to two chunks of the chunk table")
+            raise self._mismatch(f"some of its {size} bytes belong to two chunks of the chunk table")
         beyond = np.flatnonzero((offset > size) | (length > np.maximum(size, offset) - offset))
         if len(beyond):
             raise ShardTruncatedError(
                 f"{self.path}: truncated: has {size} bytes, but {self.describe(int(beyond[0]))} ends beyond them; "
                 f"fetch the shard again, then run `icrl4aht-data verify`"
             )
+
+    def _mismatch(self, fault: str) -> ShardMismatchError:
+        return ShardMismatchError(f"{self.path}: {fault}; fetch meta/ and the shard again")
 
     def _read_error(self, error: OSError) -> ReleaseError:
         if isinstance(error, FileNotFoundError):

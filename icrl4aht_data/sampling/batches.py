@@ -66,8 +66,7 @@ class Batches(Iterator[B], Generic[B]):
         self.next, self.served, self.waited = check_int("start", start, 0), 0, 0.0
         self._per_pass = 0 if self._stop is None else max(0, self._stop - self.next)
         self._closed, self._ended, self._process = False, False, os.getpid()
-        self._pool: ThreadPoolExecutor | None = None
-        self._submitted = start
+        self._pool = _new_thread()
         self._pending: deque[tuple[Future[B], B | None]] = deque()  # submitted batches with their buffers
         self._free: list[B] = []
         self._lent: B | None = None  # buffer of the batch in use by the consumer
@@ -116,24 +115,20 @@ class Batches(Iterator[B], Generic[B]):
             batch = _make_batch(self._sampler, self.next, buffer, self._put)
         else:
             # A batch is taken before another is submitted, so `prefetch + 1` buffers are enough.
-            self._submit(self.next + self._prefetch)
+            self._submit(self.next)
             future, buffer = self._pending.popleft()
-            self._submit(self.next + self._prefetch + 1)
+            self._submit(self.next + 1)
             batch = future.result()
         if self._put is None:
             self._lent = buffer
         return batch
 
-    def _submit(self, stop: int) -> None:
-        """Submit all further batches with numbers below `stop` to the thread."""
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(1, thread_name_prefix="icrl4aht-prefetch")
-            self._submitted = self.next
-        stop = stop if self._stop is None else min(stop, self._stop)
-        for i in range(self._submitted, stop):
+    def _submit(self, first: int) -> None:
+        """Submit batches to the thread until `prefetch` batches are pending, from number `first` on."""
+        stop = first + self._prefetch
+        for i in range(first + len(self._pending), stop if self._stop is None else min(stop, self._stop)):
             buffer = self._buffer()
             self._pending.append((self._pool.submit(_make_batch, self._sampler, i, buffer, self._put), buffer))
-            self._submitted = i + 1
 
     def _buffer(self) -> B | None:
         """Return a free buffer, or None if a new batch allocates its memory."""
@@ -150,9 +145,8 @@ class Batches(Iterator[B], Generic[B]):
         self._stop_thread()
 
     def _stop_thread(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-            self._pool = None
+        self._pool.shutdown(cancel_futures=True)
+        self._pool = _new_thread()
         self._pending.clear()
         self._free.clear()
         self._lent = None
@@ -187,6 +181,10 @@ class Batches(Iterator[B], Generic[B]):
         self._stop_thread()
         self._closed = self._ended = False
         self.next = check_int("next", state["next"], 0)
+
+
+def _new_thread() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="icrl4aht-prefetch")
 
 
 # A function, not a method: a reference from the thread to the iterator would keep an abandoned iterator alive.

@@ -122,7 +122,7 @@ class HistoryDraws:
         kept_steps: number of steps of an episode.
 
     Raises:
-        UnknownNameError, OptionError: for impossible options, or episodes that do not all have `kept_steps` steps.
+        UnknownNameError, OptionError: for impossible options.
     """
 
     def __init__(
@@ -130,12 +130,6 @@ class HistoryDraws:
     ) -> None:
         self.lengths, self._counts = selection.column("T"), selection.column("episodes")
         self.kept_steps: int = selection.info.environment.kept_steps
-        ended, cut = np.divmod(self.lengths, self.kept_steps)
-        # Only histories of releases without states may end within an episode.
-        if (ended != self._counts).any() or (selection.has_states and cut.any()):
-            raise OptionError(
-                f"expected episodes of {self.kept_steps} steps, found other episodes; run `icrl4aht-data verify`"
-            )
         if curriculum is not None and not isinstance(curriculum, Curriculum):
             raise OptionError(f"curriculum = {curriculum!r}: expected a Curriculum, such as Curriculum(batches=1000)")
         self.weights, self.episodes, self.curriculum = _check_weights(weights, len(selection)), episodes, curriculum

@@ -208,6 +208,12 @@ def atomic_write(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a binary or a UTF-8 text file with `atomic_write`."""
+    with atomic_write(path) as partial:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
 def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None) -> None:
     """Check that a command may write a file, or files into a folder.
 

@@ -55,20 +55,19 @@ class Option(NamedTuple):
 
 
 @cache
-def option_hints(kind: type) -> dict[str, Any]:
-    """Return the annotations of those fields of a dataclass that are options, by field name."""
-    hints = get_type_hints(kind, include_extras=True)
-    return {name: hint for name, hint in hints.items() if any(isinstance(part, Option) for part in get_args(hint))}
-
-
-@cache
-def _checked_hints(kind: type) -> dict[str, Any]:
+def _hints_with(kind: type, *parts: Any) -> dict[str, Any]:
+    """Return the annotations of those fields of a dataclass that have a part of one of the given kinds, by name."""
     hints = get_type_hints(kind, include_extras=True)
     return {
         name: hint
         for name, hint in hints.items()
-        if any(isinstance(part, (Option, Meta)) or get_origin(part) is Literal for part in annotation_parts(hint))
+        if any(type(part) in parts or get_origin(part) in parts for part in annotation_parts(hint))
     }
+
+
+def option_hints(kind: type) -> dict[str, Any]:
+    """Return the annotations of those fields of a dataclass that are options, by field name."""
+    return _hints_with(kind, Option)
 
 
 def check_options(options: Any) -> None:
@@ -80,7 +79,7 @@ def check_options(options: Any) -> None:
         OptionError: if a value has another type or is out of bounds.
         UnknownNameError: if a value is not among the choices; the message lists the choices.
     """
-    for name, hint in _checked_hints(type(options)).items():
+    for name, hint in _hints_with(type(options), Option, Meta, Literal).items():
         value = getattr(options, name)
         converted = convert_option(name, value, hint)
         if isinstance(value, list):

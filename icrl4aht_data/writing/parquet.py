@@ -69,7 +69,6 @@ def write_episodes(
 
     Raises:
         OptionError: if pyarrow is not installed.
-        IndexFormatError: if an episode does not have the release's number of steps.
     """
     schema = episode_schema(dataset)
     done = 0

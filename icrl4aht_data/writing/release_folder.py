@@ -96,9 +96,7 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
     for source in (Path(source) for source in sources if not is_address(source)):
         read = source.resolve()
         if read.is_relative_to(resolved) or resolved.is_relative_to(read):
-            relation = "is inside" if resolved.is_relative_to(read) else "contains"
-            fault = "is also read" if read == resolved else f"{relation} the input folder {source}"
-            raise OptionError(f"{target} {fault}; give another folder to write")
+            raise OptionError(f"{target}: overlaps {source}, which is read; give another folder to write")
     if not os.path.lexists(target) or (resolved.is_dir() and not any(resolved.iterdir())):
         return False
     if not overwrite:

@@ -22,7 +22,7 @@ import pytest
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError, OptionError
+from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError
 from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format.manifest import parse_manifest, write_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, memory_fields
@@ -285,9 +285,8 @@ def test_changed_episode_length_in_info_raises_errors(small_release, tmp_path):
     with pytest.raises(IndexFormatError, match=r"info\.json: expected sha256"):
         load_icrl4aht(root)
     write_manifest(root)
-    dataset = load_icrl4aht(root, layout="demo_wide")
-    with pytest.raises(OptionError, match="expected episodes of 14 steps, found other episodes; run"):
-        dataset.ad(batch_size=4, length=5, episodes=(1, 4))
+    with pytest.raises(IndexFormatError, match=r"line 1: expected episodes of 14 steps as in meta/info\.json, found"):
+        load_icrl4aht(root)
 
 
 def test_manifest_without_its_last_byte_is_refused(small_release):

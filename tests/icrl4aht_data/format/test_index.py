@@ -97,7 +97,7 @@ def test_index_queries_match_a_scan_of_all_entries(long_release):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"episodes": 99999}, "found 99999 in"),
+        ({"episodes": 99999}, "found 99999 episodes in"),
         ({"has_teammate_actions": False}, "has_teammate_actions true"),
         ({"seed": 2**63}, r"Expected `int` <= 9223372036854775807 - at `\$\.seed`"),
     ],
