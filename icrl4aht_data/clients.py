@@ -43,16 +43,16 @@ def without_credentials(text: str) -> str:
 
 
 def check_credentials(address: str) -> None:
-    """Check that a password in an address has no unencoded "/", after which the rest would be shown as a path.
+    """Check that a password in an address has no unencoded "/": messages would show the part after the "/" as a path.
 
     Raises:
         OptionError: if a password may contain an unencoded "/"; the message omits the address.
     """
     try:
         parts = urlsplit(address)
-        # "s3://user:12/3@host" would be parsed as host "user", port 12. Only a host with a dot may precede such a path.
+        # "s3://user:12/3@host" would be parsed as host "user", port 12. Unlike a user name, a host usually has a dot.
         is_clear = parts.port is None or "@" in parts.netloc or "@" not in parts.path or "." in parts.netloc
-    except ValueError:  # raised if the port is not a number
+    except ValueError:  # the port is not a number
         is_clear = False
     if not is_clear:
         raise OptionError(
@@ -74,18 +74,18 @@ class HubClient:
 
     @contextmanager
     def connect(self) -> Iterator[None]:
-        """Return a context in which requests fail after `_TIMEOUT` seconds without a response, even if retried.
+        """Return a context manager in which a request, with retries, fails after `_TIMEOUT` seconds without a response.
 
-        Two hooks set this limit, because without it huggingface_hub waits forever for some responses, and five times
-        60 s for others.
+        Two hooks set this limit. Without a limit, huggingface_hub waits forever for some responses, and five times 60 s
+        for others.
         """
         from huggingface_hub import get_session
 
         unanswered: dict[str, float] = {}
 
         def before_request(request: Any) -> None:
-            # Time is measured per address, since a server may answer some addresses only, and per host, since the
-            # client sends requests to further addresses of a host by itself.
+            # Time is measured per address, since a server may answer some addresses only, and per host, since one call
+            # of the client may send requests to several addresses of a host.
             now, keys = time.monotonic(), (str(request.url), request.url.host)
             first = min(unanswered.setdefault(key, now) for key in keys)
             left = first + _TIMEOUT - now
@@ -154,7 +154,7 @@ class FsspecClient:
 
     @contextmanager
     def connect(self) -> Iterator[None]:
-        """Return a context for requests through a new file system object, since connections do not survive a fork."""
+        """Return a context manager that opens a new file system object, since connections do not survive a fork."""
         self._files = _open_filesystem(self._address)
         yield
 

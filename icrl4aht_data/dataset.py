@@ -14,7 +14,7 @@ from msgspec import Meta
 
 from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks, task_fields, teammate_id
 from icrl4aht_data.environments import make_environment
-from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError, check_choice, unknown
+from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError, check_choice, unknown_name
 from icrl4aht_data.fetch import ReleaseLocation, open_root
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import check_meta
@@ -232,7 +232,7 @@ class Dataset(Selection):
     def plot(self) -> Picture:
         """Return a plot of returns by episode, source and layout, which notebooks display.
 
-        This reads the rewards of all selected histories.
+        Plotting reads the rewards of all selected histories.
 
         Raises:
             OptionError: if matplotlib is not installed.
@@ -274,7 +274,7 @@ class Dataset(Selection):
         }
         if task.teammate["kind"] == "rl":
             name = f"{TEAMMATES}/{task.teammate['theta']['sha256']}"
-            if not self.origin.below(name).is_dir():
+            if not self.origin.fetch_folder(name).is_dir():
                 raise OptionError(
                     f"{self.root / name}: the checkpoint of history {history_id}'s teammate is missing, because this "
                     f"release was made without checkpoints; copy it from the release that this one was made from"
@@ -311,7 +311,7 @@ class Dataset(Selection):
         }
 
     def environment_parameters(self, history_id: int) -> dict[str, Any]:
-        """Return the parameters that rebuild the environment of a history: layout names, map, recipes, episode lengths.
+        """Return the parameters needed to rebuild a history's environment: layout names, map, recipes, episode lengths.
 
         Args:
             history_id: a history of the release, whether selected or not.
@@ -328,7 +328,7 @@ class Dataset(Selection):
         }
 
     def recover_teammate(self, history_id: int, episode: int = 0) -> dict[str, Any]:
-        """Return the parameters that rebuild the teammate of a history.
+        """Return the parameters needed to rebuild a history's teammate.
 
         Args:
             history_id: a history of the release, whether selected or not.
@@ -363,7 +363,7 @@ class Dataset(Selection):
                 f"tasks.jsonl in the folder"
             )
         if entry.task_id not in self.tasks:
-            raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self.tasks)
+            raise unknown_name(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self.tasks)
         return self.tasks[entry.task_id]
 
     def ad(

@@ -1,4 +1,4 @@
-"""Exceptions of this package, which share one base class, and its warnings.
+"""Exceptions of this package, with one base class, and warnings of this package.
 
 An error's message names the file or value, what was expected, what was found, and what to do next.
 """
@@ -90,7 +90,7 @@ class FormatTooOldError(ReleaseError):
 
 
 class RemoteError(ReleaseError, OSError):
-    """A remote failed after all retries, or returned content that differs from its manifest.
+    """A remote request failed after all retries, or the fetched file differs from the release's manifest.
 
     Args:
         message: the error message, which includes the address.
@@ -145,13 +145,13 @@ def check_choice(what: str, found: object, valid: Iterable[str]) -> None:
         UnknownNameError: if the value is not valid; the message lists the valid names and suggests the nearest.
     """
     if not isinstance(found, str) or found not in tuple(valid):  # `in` would fail for an array
-        raise unknown(what, found, valid)
+        raise unknown_name(what, found, valid)
 
 
 _LISTED, _COMPARED = 50, 1000  # maximum number of valid names to list, and to compare with the wrong one
 
 
-def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:
+def unknown_name(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:
     """Return the error for an unknown name, which lists the valid names and suggests the nearest."""
     names = list(dict.fromkeys(valid))
     by_small_letters = {name.casefold(): name for name in reversed(names[:_COMPARED])}

@@ -37,7 +37,7 @@ from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import check_against_manifest, read_manifest
 from icrl4aht_data.format.schema import INDEX_FILES, MANIFEST, PARQUET_EPISODES
 from icrl4aht_data.utils import files as disk
-from icrl4aht_data.utils.progress import counted, progress_bars
+from icrl4aht_data.utils.progress import bar_updater, progress_bars
 from icrl4aht_data.utils.system import data_folder
 
 _HUB = re.compile(r"hf://datasets/(?P<repo>[\w.-]+/[\w.-]+)(?:@(?P<revision>[^@]+))?/?")
@@ -84,7 +84,7 @@ class ReleaseLocation:
             check_against_manifest(self.folder, [name])
         return self.path(name)
 
-    def below(self, name: str) -> Path:
+    def fetch_folder(self, name: str) -> Path:
         """Download and check the files of a folder, which need not exist, and return the path of the folder.
 
         Raises:
@@ -120,7 +120,7 @@ class Remote(ReleaseLocation):
         return self.url
 
     def file(self, name: str) -> Path:
-        self.fetch([name])  # also checks the hash
+        self.fetch([name])  # `fetch` also checks the hash
         return self.path(name)
 
     def fetch(self, names: Iterable[str], advance: Advance | None = None, again: bool = False) -> None:
@@ -144,7 +144,7 @@ class Remote(ReleaseLocation):
         if absent and offline_switches():
             listed = ", ".join(absent)
             raise OfflineError(
-                f"{self.url}: offline, but these files are missing or have changed: {listed}; {_unset_text()}"
+                f"{self.url}: offline, but these files are missing or have changed: {listed}; {_offline_advice()}"
             )
         if not absent:
             return
@@ -153,14 +153,14 @@ class Remote(ReleaseLocation):
             if not self.in_hub_cache:  # the Hub's client locks its own cache
                 stack.enter_context(disk.process_lock(disk.lock_path(self.folder)))
                 absent = [name for name in absent if again or not self.is_downloaded(name)]
-                for left in self.folder.glob(".partial-*"):  # left by a killed process
+                for left in self.folder.glob(".partial-*"):  # left by a killed download
                     shutil.rmtree(left, ignore_errors=True)
                 scratch = Path(stack.enter_context(TemporaryDirectory(prefix=".partial-", dir=self.folder)))
             stack.enter_context(self.client.connect())
             if advance is None:
                 size = sum(self._shard_sizes.get(name, 0) for name in absent if name.startswith("data/"))
                 show = stack.enter_context(progress_bars(quiet=not size, of_bytes=True))
-                advance = counted(show, "download", size)
+                advance = bar_updater(show, "download", size)
             pool = stack.enter_context(ThreadPoolExecutor(THREADS))
             stack.callback(pool.shutdown, cancel_futures=True)
             for file in as_completed([pool.submit(self._fetch_file, name, scratch, advance) for name in absent]):
@@ -170,7 +170,7 @@ class Remote(ReleaseLocation):
         """Download a file, and move it to its final path if its hash is the one in the manifest."""
         address, target = f"{self.url}/{name}", self.path(name)
         if scratch is None:
-            _remove_from_cache(target)  # so that the client downloads the file
+            _remove_from_cache(target)  # else the client would keep the cached file
         most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else disk.LARGEST
         path = _fetch_with_retries(self.client, address, name, scratch, advance, most)
         size, found = path.stat().st_size, disk.file_hash(path)
@@ -223,7 +223,7 @@ class Remote(ReleaseLocation):
         return read_info(self.folder).shards
 
 
-def _unset_text() -> str:
+def _offline_advice() -> str:
     """Return advice for an error in offline mode: the environment variables to unset."""
     return f"unset {' and '.join(offline_switches())} to download"
 
@@ -231,7 +231,7 @@ def _unset_text() -> str:
 def _fetch_with_retries(
     client: HubClient | FsspecClient, address: str, name: str, scratch: Path | None, advance: Advance, most: int
 ) -> Path:
-    """Download a file of at most `most` bytes, with retries; the calls of `advance` add up to the file's size."""
+    """Download a file of at most `most` bytes, with retries; the numbers given to `advance` add up to its size."""
     arrived = 0
 
     def count(size: int) -> None:
@@ -314,11 +314,13 @@ def _open_address(address: str, to: Path | None) -> Remote:
     check_credentials(address)
     client, url = FsspecClient(address), without_credentials(address).rstrip("/")
     base = data_folder() / f"{re.sub(r'[^A-Za-z0-9.]+', '-', url)[:80]}-{disk.short_hash(url.encode(), 8)}"
-    latest = base / "latest"  # contains the version found when the address was last opened
+    latest = base / "latest"  # file with the name of the version opened last
     if offline_switches():
         path = (to or base / (latest.read_text() if latest.is_file() else "none")) / MANIFEST
         if not path.is_file():
-            raise OfflineError(f"{url}: offline, and this release is not downloaded to {path.parent}; {_unset_text()}")
+            raise OfflineError(
+                f"{url}: offline, and this release is not downloaded to {path.parent}; {_offline_advice()}"
+            )
         text = path.read_bytes()
     else:
         with TemporaryDirectory() as scratch:
@@ -333,14 +335,14 @@ def _open_address(address: str, to: Path | None) -> Remote:
 
 
 def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | None) -> tuple[Path, bytes]:
-    """Download a release's manifest, and return its path and content; without a manifest there is no release."""
+    """Download a release's manifest, and return the manifest's path and content; a missing one is an error."""
     address = f"{url}/{MANIFEST}"
     try:
         with client.connect():
             path = _fetch_with_retries(client, address, MANIFEST, scratch, lambda size: None, disk.TEXT_BYTES)
     except RemoteError as error:
         if error.missing and offline_switches():
-            raise OfflineError(f"{url}: offline, and this release is not downloaded; {_unset_text()}") from None
+            raise OfflineError(f"{url}: offline, and this release is not downloaded; {_offline_advice()}") from None
         if error.missing:
             raise RootNotFoundError(f"{url}: no release at this address, expected {MANIFEST}: {error}") from None
         raise
@@ -424,7 +426,7 @@ def plan_download(
     present = {name: remote.path(name).stat().st_size for name in names if remote.path(name).exists()}
     sizes = {name: index.info.shards[name] for name in names if name in index.info.shards}
     sizes = present | sizes | remote.sizes(name for name in names if name not in sizes and name not in present)
-    compared, changed = counted(advance, "compare", sum(present.values())), []
+    compared, changed = bar_updater(advance, "compare", sum(present.values())), []
     for name, size in present.items():
         if not remote.is_downloaded(name, by_hash=True):
             changed.append(name)

@@ -237,7 +237,7 @@ def render_observations(
         )
     try:
         records = np.asarray(_read_column(rows, "state"), np.uint8)
-    except (TypeError, ValueError, OverflowError) as error:  # lists of unequal length, or values that are not bytes
+    except (TypeError, ValueError, OverflowError) as error:  # unequal lengths, or values that are not bytes
         raise OptionError(f"state: expected bytes of equally long episodes: {error}") from error
     longest = record_width(layouts)
     if records.ndim != 3 or records.shape[-1] < longest:

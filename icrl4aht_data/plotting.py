@@ -86,7 +86,7 @@ class Picture:
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:
-    """Return the running mean of real (E,) over `window` values, fewer at both ends, as float64 (E,)."""
+    """Return the running mean of `values` (E,) over `window` values, or fewer at the ends, as float64 (E,)."""
     width = max(1, window)
     sums = np.concatenate([[0.0], np.cumsum(values)])
     numbers = np.arange(len(values))
@@ -211,7 +211,7 @@ def plot_source_curves(curves: SourceCurves) -> Figure:
         ends += list(axes.dataLim.intervaly)
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
-        if axes.dataLim.x1 < 10:  # with powers of ten only, the axis would have one number
+        if axes.dataLim.x1 < 10:  # otherwise the axis would have a single tick label
             axes.xaxis.set_minor_formatter("{x:g}")
         axes.set_title(f"source {source}, {counted_histories(sum(map(len, by_split.values())))}", fontsize=9)
         axes.set_xlabel("episode", fontsize=8)

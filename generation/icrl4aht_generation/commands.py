@@ -32,7 +32,7 @@ from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import plot_layouts, save_figure
 from icrl4aht_data.utils.files import atomic_write, check_output
-from icrl4aht_data.utils.progress import counted, progress_bars
+from icrl4aht_data.utils.progress import bar_updater, progress_bars
 from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS, generate_layouts, split_of
 from icrl4aht_generation.learners.config import EncoderKind
@@ -194,7 +194,7 @@ def layouts(
         from icrl4aht_generation.layouts.playable import layouts_delivered
 
         with progress_bars(unit="layouts") as show:
-            delivered = layouts_delivered(found, counted(show, "check", count)).tolist()
+            delivered = layouts_delivered(found, bar_updater(show, "check", count)).tolist()
     rows, lines = [], []
     for layout, one in zip(found, delivered, strict=True):
         row = {

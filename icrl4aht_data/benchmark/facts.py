@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
-from icrl4aht_data.errors import check_choice, unknown
+from icrl4aht_data.errors import check_choice, unknown_name
 from icrl4aht_data.overcooked.layouts import added_layout_names
 from icrl4aht_data.utils.plugins import Plugins
 
@@ -177,7 +177,7 @@ def track_of(layout: str) -> str:
             return track
     if layout in (*added_layout_names(), *PREFERENCE_LAYOUTS["train"], *PREFERENCE_LAYOUTS["test"]):
         return "layout"
-    raise unknown("layout", layout, (*LAYOUT_NAMES, *added_layout_names()))
+    raise unknown_name("layout", layout, (*LAYOUT_NAMES, *added_layout_names()))
 
 
 def layout_order(layout: str) -> tuple[int, str]:
@@ -203,7 +203,7 @@ def check_family(family: object) -> None:
         UnknownNameError: for an unknown family; the message lists the valid names and suggests the nearest.
     """
     if family not in FAMILIES and family not in (families := all_families()):
-        raise unknown("teammate_family", family, families)
+        raise unknown_name("teammate_family", family, families)
 
 
 def check_membership(track: Any, split: Any, layout: Any) -> None:
@@ -216,4 +216,4 @@ def check_membership(track: Any, split: Any, layout: Any) -> None:
     check_choice("split", split, SPLITS)
     published = TRACKS.get(track, {}).get(split, ())
     if layout not in published and layout not in (names := track_layouts(track, split)):
-        raise unknown(f"layout of the {split} split of track {track}", layout, names)
+        raise unknown_name(f"layout of the {split} split of track {track}", layout, names)

@@ -29,7 +29,7 @@ from icrl4aht_data.benchmark.facts import (
     check_membership,
     kind_family,
 )
-from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, check_choice, unknown
+from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, check_choice, unknown_name
 from icrl4aht_data.overcooked.layouts import Layout, get_layout, with_recipes
 from icrl4aht_data.utils.files import is_safe_path, json_hash, parse_json, read_lines
 
@@ -281,7 +281,7 @@ def check_teammate(teammate: dict[str, Any]) -> None:
     family, is_heuristic = kind_family(found.family), found.kind == "heuristic"
     if family is None or (family == "rl") == is_heuristic:
         kinds = (*HEURISTIC_KINDS, *TEAMMATE_PLUGINS.names) if is_heuristic else ALGORITHMS
-        raise unknown(f"{found.kind} family", found.family, kinds)
+        raise unknown_name(f"{found.kind} family", found.family, kinds)
     if not is_heuristic:
         checkpoint = _convert(found.theta, _RlTheta, "teammate.theta: ").checkpoint
         if not is_safe_path(checkpoint):

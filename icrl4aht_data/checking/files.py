@@ -63,7 +63,7 @@ def check_files(
 
 
 def _recorded_sizes(root: Path, listed: Mapping[str, str]) -> dict[str, int]:
-    """Return the sizes of the shards in meta/info.json, by shard; empty if that file does not match the manifest."""
+    """Return shard -> bytes from meta/info.json; empty if meta/info.json does not match the manifest."""
     try:
         shards = read_info(root).shards
         return shards if file_hash(root / INFO) == listed.get(INFO) else {}
@@ -114,6 +114,6 @@ def check_remote_sizes(remote: Remote, index: Index, shards: list[str], report: 
         report.add("data", str(error))
         return
     for name, found in sizes.items():
-        expected = index.info.shards.get(name, found)  # `check_index` reports unknown names
+        expected = index.info.shards.get(name, found)  # `check_index` reports shards that are not in info.json
         if found != expected:
             report.add(name, f"expected {expected:,} bytes, found {found:,}")

@@ -96,7 +96,7 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
 def _check_disjoint_teammates(tasks: Iterable[Task], report: Report) -> None:
     """Check that training and test tasks of a track have no common teammates."""
     seen: dict[tuple[str, str, str], str] = {}
-    for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # training tasks before test tasks
+    for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # training tasks come first
         key = (task.track, task.layout.name, json.dumps(task.teammate, sort_keys=True))
         if task.split == "train":
             seen[key] = task.task_id
@@ -114,7 +114,7 @@ def _check_info(index: Index, tasks: list[Task], provenance: ProvenanceByTask | 
         report.add(INFO, f"shards: expected {sorted(shards)}, found {sorted(info.shards)}")
     elif report.ok and provenance is not None:
         described = replace(described, statistics=layout_statistics(described, entries, tasks, provenance))
-    found = parse_json(read_text(resolve_inside(root, INFO)))  # may have unknown fields
+    found = parse_json(read_text(resolve_inside(root, INFO)))  # read as plain JSON, to find unknown fields
     for name in sorted(found.keys() - {field.name for field in fields(ReleaseInfo)}):
         report.add(INFO, f"{name}: an unknown field")
     for name, expected in described.to_json().items():
@@ -149,7 +149,7 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
 
 
 def _contradictions(made: Provenance, entries: Sequence[Entry], seed: int | None) -> Iterator[str]:
-    """Yield each contradiction within a provenance, or with the index or the task's seed."""
+    """Yield each contradiction in a task's provenance, or between the provenance and the index or the task's seed."""
     first, count = entries[0], len(entries)
     if first.source in SCRIPTED_SOURCES and made.expert and made.expert.policy_sha256:
         labeller = made.expert.policy_sha256
@@ -162,7 +162,7 @@ def _contradictions(made: Provenance, entries: Sequence[Entry], seed: int | None
     episodes = noise.get("episodes")
     stream, learner = (max(entries, key=attrgetter(name)) for name in ("env_idx", "learner"))
     other = next((entry for entry in entries if entry.episodes != episodes), first)
-    # Checks have a name, value, relation, bound and text of the bound; value or bound None is unknown and not checked.
+    # Checks are (name, value, relation, bound, text of the bound). Checks with an unknown number (None) are skipped.
     checks: list[tuple[str, Any, Callable[[Any, Any], bool], Any, str]] = [
         ("seed", made.seed, eq, seed, "the task's {}"),
         ("ego_hash", made.ego_hash, eq, made.ego and json_hash(made.ego), "{} of `ego`"),

@@ -60,7 +60,9 @@ def check_history(
     try:
         step_bytes = sum(field.element(layout, info.kind).itemsize for field in entry.stored_fields(info.kind))
         if (size := _COPIES * entry.T * step_bytes) > free_memory():
-            raise OptionError(f"checking this history takes {size / 1e9:.3g} GB of memory, more than is free")
+            raise OptionError(
+                f"checking this history takes {size / 1e9:.3g} GB of memory, more than is free; use a machine with more"
+            )
         for fault in _history_faults(history, layout, info.environment.kept_steps, deep=report.level == "deep"):
             report.add(entry.shard, f"history {entry.history_id}: {fault}")
         arrays = (history.read(name) for name in (record_field(info.kind).name, "actions"))
@@ -152,7 +154,7 @@ def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: 
 
 
 def check_structure(shard: Shard, values: bool = False) -> list[str]:
-    """Return faults in the bytes between chunks, and differences between libhdf5 and `Shard` in reading the file.
+    """Return faults in the bytes between chunks, and differences between what libhdf5 and `Shard` read from the file.
 
     Args:
         shard: the shard.
@@ -161,7 +163,7 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
     ordered = np.sort(shard.table, order="offset")
     stops, starts = (ordered["offset"] + ordered["size"]).tolist(), ordered["offset"].tolist()
     size = shard.path.stat().st_size
-    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // METADATA_ROW_BYTES  # as many rows as the writer makes
+    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // METADATA_ROW_BYTES  # the most rows that the writer makes
     faults, between = [], np.flatnonzero(shard.table["rows"] == 0).tolist()
     if len(ordered) > most or [0, *stops] != [*starts, size]:
         faults, between = [f"the chunk table does not cover the file's {size} bytes, each once"], []
@@ -223,4 +225,4 @@ def _value_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
             continue  # the damage is already reported, and libhdf5 must not inflate the chunk
         theirs = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
         if not np.array_equal(theirs, ours):
-            yield f"history {entry.history_id}: HDF5 reads other values of {field.name} than we do"
+            yield f"history {entry.history_id}: libhdf5 and this package read different values of {field.name}"

@@ -17,7 +17,7 @@ from typing import Any
 import click
 
 from icrl4aht_data.commands.verbs import SECTIONS, VERB_GROUP, VERBS, Verb
-from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
+from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown_name
 from icrl4aht_data.utils.files import FULL, describe_disk, final_name
 from icrl4aht_data.utils.install_hints import missing_library
 from icrl4aht_data.utils.plugins import Plugins
@@ -103,7 +103,7 @@ class VerbGroup(click.Group):
         if not self._prefix and f"research {args[0]}" in all_verbs():
             ctx.fail(f"{args[0]} is a command of the group research: icrl4aht-data research {' '.join(args)}")
         if not args[0].startswith("-") and args[0] not in self._verbs():
-            ctx.fail(str(unknown("command", args[0], self._verbs())))
+            ctx.fail(str(unknown_name("command", args[0], self._verbs())))
         return super().resolve_command(ctx, args)
 
     def _verbs(self) -> dict[str, Verb]:
@@ -137,7 +137,7 @@ def run(command: click.Command) -> None:
     If the reader of a pipe exits (`| head`), the command stops quietly with exit code 1. Output to a stream that is
     closed from the start (`>&-`) is dropped.
     """
-    for name in ("stdout", "stderr"):  # so that no opened file gets the descriptor of a closed stream
+    for name in ("stdout", "stderr"):  # else a file opened later gets the descriptor 1 or 2
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     try:

@@ -71,7 +71,7 @@ def report_lines(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _packages(problems: Problems) -> dict[str, Any]:
-    """Return the version of each required or optional package, or the command that installs an optional one."""
+    """Return the version of each required or optional package; for a missing optional one, its install command."""
     facts: dict[str, Any] = {PACKAGE: _installed(PACKAGE), "folder": str(MINI.parent)}
     if facts[PACKAGE] is None:
         problems[f"{PACKAGE}: not installed"] = f"pip install {PACKAGE}, or -e . in a checkout"

@@ -54,7 +54,7 @@ from icrl4aht_data.plotting import PICTURES, plot_learning_curves
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
 from icrl4aht_data.utils.files import check_output
-from icrl4aht_data.utils.progress import counted, progress_bars
+from icrl4aht_data.utils.progress import bar_updater, progress_bars
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
@@ -139,7 +139,7 @@ def show(
     console = Console(markup=False, highlight=False)
     if history_id is None:
         console.print(facts.pop("summary"), "", layout_table(dataset), "", sep="\n")
-        del facts["layouts"]  # the table shows the layouts
+        del facts["layouts"]  # already shown in the table
     else:
         console.print(repr(dataset[0]), "", sep="\n")
     console.print(*fact_lines(facts), sep="\n")
@@ -191,7 +191,7 @@ def browse(
     all episodes fit, the page has some episodes of each history, including the first and the last, and says which. A
     release of observations cannot be shown, since it has no states to draw.
     """
-    with suppress(OSError), out.open("rb") as stream:  # a page of this command may be replaced
+    with suppress(OSError), out.open("rb") as stream:  # a page that `browse` wrote may be replaced
         overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
     check_output(out, overwrite)
     matching = load_icrl4aht(root, **filters)
@@ -238,7 +238,7 @@ def download(
         plan = plan_download(str(root), to=to, advance=show, **filters)
         facts = plan.to_json()
         if not dry_run:
-            fetch_planned(plan, counted(show, "download", plan.size))
+            fetch_planned(plan, bar_updater(show, "download", plan.size))
     absent = sorted((*plan.absent, *plan.changed))
     lines = [f"{plan.files[name]:>15,}  {name}" for name in absent if dry_run]
     lines += [f"{name}: had changed{'' if dry_run else ', was fetched again'}" for name in plan.changed]

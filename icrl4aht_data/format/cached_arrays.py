@@ -24,8 +24,8 @@ from icrl4aht_data.utils.files import NO_ROOM, add_filename, allocate, describe_
 from icrl4aht_data.utils.system import CACHE_VARIABLE, cache_folder, cache_limit
 
 _CONTENTS = "contents.json"  # file with dtype and shape of every array
-_KEY = re.compile(r"[a-z]+-[0-9a-f]{32,64}")  # only folders with such a name are removed to free space
-_ABANDONED = 24 * 3600  # seconds after which the maker of an unfinished set counts as killed
+_KEY = re.compile(r"[a-z]+-[0-9a-f]{32,64}")  # only folders with a name of this form are removed to free space
+_ABANDONED = 24 * 3600  # age in seconds at which an unfinished set is removed
 
 
 def cacheable_bytes() -> int:
@@ -63,7 +63,7 @@ def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> dict[st
         return arrays
     if size > cache_limit():
         raise OptionError(
-            f"{folder.parent}: the arrays have {size:,} bytes, but the cache may have {cache_limit():,}: raise "
+            f"{folder.parent}: the arrays have {size:,} bytes, but the cache is limited to {cache_limit():,}: raise "
             f'ICRL4AHT_CACHE_BYTES, select fewer histories, or use cache="stream"'
         )
     try:
@@ -99,7 +99,7 @@ def _open_arrays(folder: Path) -> dict[str, np.ndarray] | None:
         for name, described in json.loads((folder / _CONTENTS).read_text(encoding="utf-8")).items():
             path = folder / f"{name}.npy"
             array = np.lib.format.open_memmap(path, mode="r")
-            if _describe(array) != described or array.offset + array.nbytes != path.stat().st_size:
+            if _dtype_and_shape(array) != described or array.offset + array.nbytes != path.stat().st_size:
                 return None
             arrays[name] = np.asarray(array)
     except (OSError, ValueError, AttributeError):
@@ -109,7 +109,7 @@ def _open_arrays(folder: Path) -> dict[str, np.ndarray] | None:
     return arrays
 
 
-def _describe(array: np.ndarray) -> list:
+def _dtype_and_shape(array: np.ndarray) -> list:
     return [array.dtype.str, list(array.shape)]
 
 
@@ -119,13 +119,13 @@ def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> dict[s
     new.mkdir()
     build(new)
     paths = sorted(new.glob("*.npy"))
-    contents = {path.stem: _describe(np.lib.format.open_memmap(path, mode="r")) for path in paths}
+    contents = {path.stem: _dtype_and_shape(np.lib.format.open_memmap(path, mode="r")) for path in paths}
     (new / _CONTENTS).write_text(json.dumps(contents), encoding="utf-8")
     for _ in range(3):
         arrays = _open_arrays(folder)
         if arrays is not None:
             return arrays
-        with suppress(OSError):  # a damaged set, or anything else with this name, is in the way
+        with suppress(OSError):  # move a damaged set, or a file of this name, out of the way
             folder.rename(scratch / "damaged")
         with suppress(OSError):  # another process may just have moved a set to this folder
             new.rename(folder)

@@ -1,4 +1,4 @@
-"""Paths and files of checkpoints: learned teammates of a release or a suite, and expert egos of a release."""
+"""Checkpoint paths and files of learned teammates, in a release or a teammate suite, and of a release's expert egos."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CHECKPOINT_BYTES = 64 * 2**20
 
 
 def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
-    """Return the checkpoint folder of a learned teammate, which a release names by hash and a suite by path.
+    """Return a learned teammate's checkpoint folder, whose name is a hash in a release and a path in a teammate suite.
 
     Args:
         folder: the folder `TEAMMATES` of a release, or the folder of a suite.
@@ -47,7 +47,7 @@ def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict
 
 
 def expert_folder(sha256: str) -> str:
-    """Return the path in a release of an expert's checkpoint folder, which is named by the SHA-256 of its weights."""
+    """Return the path in a release of an expert's checkpoint folder, named by the SHA-256 of the expert's weights."""
     return f"{EXPERTS}/{sha256}"
 
 

@@ -120,8 +120,10 @@ def check_layouts_stored(names: Iterable[str], stored: Container[str], path: Pat
     """Check that each layout of an index belongs to the benchmark or is stored in the release.
 
     Raises:
-        IndexFormatError: if a layout is neither, even if an opened release or an installed package has the layout.
+        IndexFormatError: if a layout is in neither, even if another release or an installed package has the layout.
     """
     for name in names:
         if name not in LAYOUTS and name not in stored:
-            raise IndexFormatError(f"{path}: layout {name!r} is neither published nor in {LAYOUTS_FILE}; add it there")
+            raise IndexFormatError(
+                f"{path}: layout {name!r} is neither in the benchmark nor in {LAYOUTS_FILE}; add it to the file"
+            )

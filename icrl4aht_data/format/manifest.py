@@ -49,9 +49,9 @@ def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
         UnsafePathError: if a path points outside the release, or is not the path of a release's file.
     """
     if not text:
-        raise IndexFormatError(f"{path} is empty: expected a line for each file of the release; fetch it again")
+        raise IndexFormatError(f"{path} is empty: expected a line for each file of the release; download it again")
     if not text.endswith("\n"):
-        raise IndexFormatError(f"{path} is cut off: the last line does not end with a newline; fetch it again")
+        raise IndexFormatError(f"{path} is cut off: the last line does not end with a newline; download it again")
     listed: dict[str, str] = {}
     folded: dict[str, str] = {}  # names by lower-case name, to find names that are equal on disks that ignore case
     for number, line in enumerate(text.splitlines(), start=1):
@@ -72,7 +72,9 @@ def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
             raise IndexFormatError(f"{path}, line {number}: {name!r} is listed twice; fetch the release again")
         twin = folded.setdefault(name.casefold(), name)
         if twin != name:
-            raise IndexFormatError(f"{path}, line {number}: {name!r} and {twin!r} are the same file on some systems")
+            raise IndexFormatError(
+                f"{path}, line {number}: {name!r} and {twin!r} are the same file on some systems: warn the publisher"
+            )
         listed[name] = digest
     return MappingProxyType(listed)
 

@@ -293,14 +293,14 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class _EgoScale(Struct):
-    """Hyper-parameters of the ego that this package reads; it ignores the others."""
+    """Hyper-parameters of the ego that this package reads; other hyper-parameters are not checked."""
 
     total_steps: int
     environments: int
 
 
 class _NoiseSetting(Struct):
-    """Known settings of noise schedules, which are validated; other settings stay unchanged."""
+    """Settings of noise schedules that are validated; other settings are accepted unchecked."""
 
     histories: _Positive | None = None
     episodes: _Positive | None = None

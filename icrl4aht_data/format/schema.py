@@ -241,10 +241,10 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return self._has_stored(self.stored_field(field))
 
     def stored_field(self, field: Field) -> Field:
-        """Return the field that stores the values of a field.
+        """Return the field whose stored array has the values of the given field; usually this is the given field.
 
-        For `oracle_actions` of a noise history this may be `expert_actions`: the expert is the oracle, so a release may
-        store the actions only once. Other fields store their own values.
+        In histories of source "noise" the expert is the oracle, so `oracle_actions` may be stored only as
+        `expert_actions`.
         """
         same = field.name == "oracle_actions" and self.source == "noise" and not self.has_oracle_actions
         return FIELDS["expert_actions"] if same else field
@@ -271,7 +271,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return msgspec.structs.asdict(self) | {"obs_shape": list(self.obs_shape)} | texts
 
 
-_LEFT_OUT = ("label_view", "teammate_of_episode")  # omitted if None, so that old index lines keep their bytes
+_LEFT_OUT = ("label_view", "teammate_of_episode")  # omitted if None, as in old indexes
 
 ENTRY_HINTS: dict[str, Any] = get_type_hints(Entry)
 """Types of the fields of an index line by name, without bounds."""

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, unknown_name
 from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.cells import (
     BUTTON,
@@ -325,12 +325,12 @@ def get_layout(name: str) -> Layout:
         PluginError: if a registered layout cannot be used.
     """
     if not isinstance(name, str):
-        raise unknown("layout", name, all_layout_names())
+        raise unknown_name("layout", name, all_layout_names())
     layout = LAYOUTS.get(name) or _BY_ALIAS.get(name) or _RELEASE_LAYOUTS.get(name) or _manifest_layouts().get(name)
     if layout is not None:
         return layout
     if name not in LAYOUT_PLUGINS.names:
-        raise unknown("layout", name, all_layout_names())
+        raise unknown_name("layout", name, all_layout_names())
     layout = LAYOUT_PLUGINS.load(name, Layout)
     if {layout.name, layout.alias} != {name}:
         raise LAYOUT_PLUGINS.error(

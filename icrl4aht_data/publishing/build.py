@@ -1,4 +1,4 @@
-"""Preparation of a release for publication: adds a card, figures, Parquet files and Croissant metadata."""
+"""Preparation of a release for publication, with a card, figures, Parquet files and Croissant metadata."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def build_release(
     if missing:
         raise OptionError(f"building a release needs {', '.join(missing)}: {install_command('plot', 'hf')}")
     check_valid(source, advance)
-    kept = {name: digest for name, digest in read_manifest(source).items() if not _is_built(name)}
+    kept = {name: digest for name, digest in read_manifest(source).items() if not _is_written_by_build(name)}
     with atomic_folder(target, overwrite=overwrite, sources=[source]) as root:
         for number, name in enumerate(kept, start=1):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -74,7 +74,10 @@ def build_release(
         digests = {name: file_hash(root / name) for name in files_below(root)}
         for name, digest in kept.items():
             if digests.get(name) != digest:
-                raise ReleaseError(f"{source / name}: changed while it was copied; sha256 is now {digests.get(name)}")
+                raise ReleaseError(
+                    f"{source / name}: changed while it was copied; sha256 is now {digests.get(name)}; "
+                    f"build the release again"
+                )
         today = datetime.datetime.now(datetime.UTC).date()
         write_json(root / CROISSANT, croissant(root, digests, published or today))
         write_manifest(root, digests)
@@ -88,7 +91,7 @@ def check_valid(root: Path, advance: NamedProgress = lambda what, done, total: N
         ReleaseError: if a problem is found; the message names the first three.
     """
     if not (root / MANIFEST).exists():
-        read_info(root)  # its error says that the folder is not a release
+        read_info(root)  # raises an error that names the problem if the folder is not a release
     report = verify_release(root, advance=advance)
     if not report.ok:
         found = first_problems([f"{finding.file}: {finding.problem}" for finding in report.findings])
@@ -101,7 +104,7 @@ def first_problems(problems: Sequence[str]) -> str:
     return "; ".join(problems[:3]) + more
 
 
-def _is_built(name: str) -> bool:
+def _is_written_by_build(name: str) -> bool:
     """Return whether building a release writes this file, which is then not copied from the source."""
     folders = ("figures/", f"{PARQUET_INDEX}/", f"{PARQUET_EPISODES}/")
     is_card = name == RELEASE_CARD or name.endswith(f"/{RELEASE_CARD}")

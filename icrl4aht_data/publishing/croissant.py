@@ -33,7 +33,7 @@ _FORMATS = {
     ".parquet": "application/x-parquet",
     ".safetensors": "application/vnd.safetensors",
 }
-_TYPES = {"bool": "BOOL", "string": "TEXT", "float": "FLOAT", "double": "FLOAT"}  # by Arrow type; INTEGER for others
+_TYPES = {"bool": "BOOL", "string": "TEXT", "float": "FLOAT", "double": "FLOAT"}  # by Arrow type; others are INTEGER
 _TERMS_OF_1_1 = {
     "arrayShape": "cr:arrayShape",
     "containedIn": "cr:containedIn",
@@ -62,7 +62,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
     terms = mlc.Rdf(context=mlc.Rdf().context | _TERMS_OF_1_1)
     context = mlc.Context(rdf=terms, conforms_to=_STANDARD)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # dependencies of mlcroissant warn
+        warnings.simplefilter("ignore", DeprecationWarning)  # raised by dependencies of mlcroissant
         files = [
             mlc.FileObject(
                 ctx=context,

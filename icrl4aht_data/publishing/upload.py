@@ -1,4 +1,4 @@
-"""Upload of a release to the Hugging Face Hub: uploads and compares the files, and tags the commit."""
+"""Upload of a release to the Hugging Face Hub, followed by a comparison of the files and a tag for the commit."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def upload_release(
 
     found, folder = re.fullmatch(r"hf://datasets/([\w.-]+/[\w.-]+)/?", str(address)), Path(folder)
     if found is None:
-        raise OptionError(f"{address!r}: expected hf://datasets/ORG/REPO; the data version gives the tag")
+        raise OptionError(f"{address!r}: expected hf://datasets/ORG/REPO; the tag is the data version")
     check_valid(folder, advance)
     api, repo, version = HfApi(), found[1], read_info(folder).data_version
     sizes = {name: (folder / name).stat().st_size for name in sorted([*read_manifest(folder), MANIFEST])}
@@ -104,7 +104,7 @@ def upload_release(
 
 
 def _complete_plan(api: HfApi, plan: Upload, folder: Path, private: bool) -> Upload:
-    """Complete a plan of an upload with the state of the repository, which is not changed."""
+    """Add the state of the repository to the plan of an upload; the repository is not changed."""
     from huggingface_hub.errors import RepositoryNotFoundError
 
     try:
@@ -152,7 +152,7 @@ def _upload_and_tag(api: HfApi, plan: Upload, folder: Path) -> Upload:
 
 
 def _differences(api: HfApi, plan: Upload, revision: str, folder: Path) -> list[str]:
-    """Return the differences between a revision of the repository and the release, by names and by the manifest."""
+    """Return the differences in file names and manifest between a revision of the repository and the release."""
     present = _repository_files(api, plan.repo, revision)
     differences = [f"{name}: not in the release" for name in sorted(present - plan.files.keys())]
     differences += [f"{name}: missing" for name in plan.files if name not in present]

@@ -97,7 +97,7 @@ def parse_json(text: str) -> Any:
     """
     try:
         value = json.loads(text)
-    except (ValueError, RecursionError) as error:  # also raised for too many digits or levels
+    except (ValueError, RecursionError) as error:  # `json` raises these also for too many digits or levels
         raise IndexFormatError(f"not JSON: {error}") from error
     level = [value]
     for _ in range(_DEPTH):
@@ -297,7 +297,7 @@ _PART_BYTES = 200  # maximum bytes of a path component; temporary files have lon
 
 def files_below(folder: Path) -> Iterator[str]:
     """Yield the relative paths of all files below a folder; symbolic links are not followed."""
-    folders = [""]  # instead of `os.walk`, which fails on folders deeper than Python's recursion limit
+    folders = [""]  # stack; `os.walk` fails on folders deeper than Python's recursion limit
     while folders:
         prefix = folders.pop()
         try:
@@ -349,8 +349,8 @@ def resolve_inside(folder: Path, name: str) -> Path:
     except PermissionError as error:
         reason = f"cannot be read: {error.strerror}; check the permissions of its folder"
         raise IndexFormatError(f"{path}: {reason}") from error
-    except (OSError, RuntimeError) as error:  # circular links, or names that this file system does not accept
-        raise UnsafePathError(f"{path}: cannot be followed: {error}") from error
+    except (OSError, RuntimeError) as error:  # circular link, or a name that the file system rejects
+        raise UnsafePathError(f"{path}: cannot be resolved: {error}") from error
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise UnsafePathError(f"{path}: neither a file nor a folder; do not use this release")
     return path

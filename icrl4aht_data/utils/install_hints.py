@@ -1,6 +1,6 @@
 """Address of the project, and commands that install missing optional packages.
 
-The commands add an extra to the installed copy of this package, from any source.
+The commands add an extra to the installed package, whether it comes from an index, a repository or a folder.
 """
 
 from __future__ import annotations

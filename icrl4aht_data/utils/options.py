@@ -1,8 +1,8 @@
-"""Option classes, whose annotations define types, bounds and help texts, and checks of single arguments.
+"""Option classes (dataclasses whose annotations define types, bounds and help texts), and checks of single arguments.
 
-An option class is a dataclass that checks itself, so the command line (`icrl4aht_data.commands.dataclass_options`),
-TOML and JSON files and Python code have the same bounds. Modules with option classes do not import JAX, to keep
-`--help` fast.
+An option class checks its values, so the bounds are the same on the command line
+(`icrl4aht_data.commands.dataclass_options`), in TOML and JSON files and in Python code. Modules with option classes do
+not import JAX, to keep `--help` fast.
 
     @dataclass(frozen=True)
     class Options:
@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from icrl4aht_data.errors import OptionError, PositionError, PositionTypeError, unknown
+from icrl4aht_data.errors import OptionError, PositionError, PositionTypeError, unknown_name
 
 Count = Annotated[int, Meta(ge=1)]
 Natural = Annotated[int, Meta(ge=0)]
@@ -101,7 +101,7 @@ def convert_option(name: str, value: Any, hint: Any, strict: bool = True) -> Any
     """
     choices = option_choices(hint)
     if choices and value not in choices and (value is not None or type(None) not in annotation_parts(hint)):
-        raise unknown(name, value, choices)
+        raise unknown_name(name, value, choices)
     try:
         converted = msgspec.convert(value, hint, strict=strict)
     except msgspec.ValidationError as error:
@@ -140,7 +140,7 @@ def replace_options(options: Options, values: Mapping[str, Any], where: str = ""
     changes = {}
     for name, value in values.items():
         if name not in known:
-            raise unknown("key", where + name, [where + each for each in known])
+            raise unknown_name("key", where + name, [where + each for each in known])
         before = getattr(instance, name)
         if dataclasses.is_dataclass(before) and not isinstance(value, Mapping):
             raise OptionError(f"{where}{name} = {value!r}: expected a table")

@@ -34,7 +34,7 @@ def progress_bars(quiet: bool = False, unit: str = "", of_bytes: bool = False) -
         *((DownloadColumn(), TransferSpeedColumn()) if of_bytes else ()),
         console=console,
         transient=True,
-        # Lines show the mean speed, since updates may be minutes apart; rich ignores work before the first update.
+        # Lines of text show the mean speed since the first update, because updates may be minutes apart.
         speed_estimate_period=30 if console.is_terminal else math.inf,
     )
     numbers: dict[str, TaskID] = {}
@@ -49,7 +49,7 @@ def progress_bars(quiet: bool = False, unit: str = "", of_bytes: bool = False) -
         yield show
 
 
-def counted(show: Callable[..., None], name: str, total: int) -> Callable[[int], None]:
+def bar_updater(show: Callable[..., None], name: str, total: int) -> Callable[[int], None]:
     """Return a function that advances the bar `name` by a number; any thread may call the function."""
     done, lock = 0, threading.Lock()
 

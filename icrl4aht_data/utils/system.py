@@ -1,4 +1,4 @@
-"""Free memory, a pool of threads, and the folders for cached arrays and fetched releases.
+"""Amount of free memory, a pool of threads, and the folders for cached arrays and fetched releases.
 
 The cache folder is $ICRL4AHT_CACHE_DIR, else the user's cache folder (`platformdirs`); its size limit is
 $ICRL4AHT_CACHE_BYTES (100 GB by default). Release folders are not used as caches: they contain only files of the
@@ -57,7 +57,7 @@ def free_memory() -> int:
         free.append(int((_CGROUP / "memory.max").read_text()) - int((_CGROUP / "memory.current").read_text()))
     if free:
         return max(0, min(free))
-    try:  # other systems than Linux: half of the machine's memory
+    try:  # on systems other than Linux, half of the machine's memory
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     except (AttributeError, ValueError, OSError):
         return 4 * 2**30
@@ -107,15 +107,15 @@ CACHE_VARIABLE, DATA_VARIABLE = "ICRL4AHT_CACHE_DIR", "ICRL4AHT_DATA_DIR"
 
 
 def cache_folder() -> Path:
-    """Return the folder of cached arrays; ~/.cache/icrl4aht by default on Linux. Reads the environment at each call."""
+    """Return the folder of cached arrays: $ICRL4AHT_CACHE_DIR if set, else ~/.cache/icrl4aht on Linux."""
     own = os.environ.get(CACHE_VARIABLE)
     return Path(own).expanduser() if own else platformdirs.user_cache_path("icrl4aht", appauthor=False)
 
 
 def data_folder() -> Path:
-    """Return the folder of fetched releases; ~/.local/share/icrl4aht by default on Linux.
+    """Return the folder of fetched releases: $ICRL4AHT_DATA_DIR if set, else ~/.local/share/icrl4aht on Linux.
 
-    Reads the environment at each call. Unlike in the cache folder, no file is removed automatically.
+    Unlike in the cache folder, no file is removed automatically.
     """
     own = os.environ.get(DATA_VARIABLE)
     return Path(own).expanduser() if own else platformdirs.user_data_path("icrl4aht", appauthor=False)

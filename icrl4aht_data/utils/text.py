@@ -15,7 +15,7 @@ def counted_histories(number: int) -> str:
     return counted_noun(number, "history", "histories")
 
 
-_LISTED = 10  # maximum number of names of a list in a text
+_LISTED = 10  # length of the longest list of names that is shown completely
 
 
 def listed_names(names: Sequence[str]) -> str:

@@ -50,10 +50,10 @@ def stored_task(
     files: dict[str, Path] = {}
     for one in provenance.played_tasks(task):
         if one.teammate.get("kind") == "rl":
-            dataset.origin.below(f"{TEAMMATES}/{one.teammate['theta']['sha256']}")  # fetches and checks the files
+            dataset.origin.fetch_folder(f"{TEAMMATES}/{one.teammate['theta']['sha256']}")
         files |= checkpoint_files(dataset.root / TEAMMATES, one, dataset.root)
     if provenance.expert is not None and (sha256 := provenance.expert.policy_sha256) is not None:
-        files |= expert_files(dataset.origin.below(expert_folder(sha256)), sha256, dataset.root)
+        files |= expert_files(dataset.origin.fetch_folder(expert_folder(sha256)), sha256, dataset.root)
     return NewTask(task, provenance, len(dataset), load, files)
 
 

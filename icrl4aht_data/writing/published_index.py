@@ -14,7 +14,7 @@ import msgspec
 
 from icrl4aht_data.benchmark.facts import FAMILIES, HEURISTIC_KINDS, KIND_FAMILIES
 from icrl4aht_data.benchmark.tasks import named_task
-from icrl4aht_data.errors import Icrl4ahtError, PublishedFormatError, unknown
+from icrl4aht_data.errors import Icrl4ahtError, PublishedFormatError, unknown_name
 from icrl4aht_data.format.schema import ENTRY_HINTS, Entry, check_name
 from icrl4aht_data.utils.files import parse_json, read_lines
 
@@ -78,7 +78,7 @@ def _translate(line: dict[str, Any]) -> dict[str, Any]:
     family, kind = line["teammate_family"], line["teammate_kind"]
     new = _FAMILY_MAP.get(family) or _FAMILY_MAP.get(family.lower())
     if new is None:
-        error = unknown("teammate_family", family, _FAMILY_MAP)
+        error = unknown_name("teammate_family", family, _FAMILY_MAP)
         raise PublishedFormatError(f"{error} Replace the name in the index by a valid one")
     new_family, new_kind = (new, kind) if new in FAMILIES else (_KINDS[new], new)
     if kind in _GENERAL:

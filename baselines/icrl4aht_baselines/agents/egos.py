@@ -20,7 +20,7 @@ from icrl4aht_baselines.methods.view_change import no_change
 from icrl4aht_baselines.training.histories import TrainedModel, read_trained
 from icrl4aht_baselines.training.run_folder import CONFIG
 from icrl4aht_data.benchmark.facts import track_of
-from icrl4aht_data.errors import OptionError, UnknownNameError, check_choice, unknown
+from icrl4aht_data.errors import OptionError, UnknownNameError, check_choice, unknown_name
 from icrl4aht_data.overcooked.actions import ACTIONS, STAY
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import Layout
@@ -133,7 +133,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
     model = bundled_models().get(name)
     if model is None and not Path(name).is_dir():
         hint = "A trained model is named by its folder, which `icrl4aht-data train` makes."
-        raise UnknownNameError(f"{unknown('agent', name, agent_names())} {hint}")
+        raise UnknownNameError(f"{unknown_name('agent', name, agent_names())} {hint}")
     if model is None and not (Path(name) / CONFIG).is_file():
         raise UnknownNameError(f"{name}: not a run: {CONFIG} is missing; `icrl4aht-data train` makes runs")
     own_greedy = model is None or not model.sampled

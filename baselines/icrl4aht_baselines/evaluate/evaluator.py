@@ -52,7 +52,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.channels import channel_names
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.options import check_int
-from icrl4aht_data.utils.progress import counted, progress_bars
+from icrl4aht_data.utils.progress import bar_updater, progress_bars
 from icrl4aht_data.utils.system import usable_cores
 
 MakeEgo = Callable[[Layout], Policy | HostPolicy]
@@ -121,7 +121,7 @@ def evaluate(
     programs = Programs() if programs is None else programs
     evaluation = _Evaluation(make_ego, rules, control, seeds, suite, settings, programs)
     with progress_bars(quiet=played is not None, unit="episodes") as show:
-        played = played or counted(show, f"{agent}, {rules.name}", len(tasks) * len(seeds) * rules.episodes)
+        played = played or bar_updater(show, f"{agent}, {rules.name}", len(tasks) * len(seeds) * rules.episodes)
         played(len(results) * len(seeds) * rules.episodes)
         for result in evaluation.play(missing, played):
             results[result.task_id] = result

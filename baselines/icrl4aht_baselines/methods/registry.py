@@ -16,7 +16,7 @@ from icrl4aht_baselines.methods.method import Method, World
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.rl2 import rl2
 from icrl4aht_baselines.methods.tokens import FEATURES, BatchView
-from icrl4aht_data.errors import unknown
+from icrl4aht_data.errors import unknown_name
 from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.plugins import METHOD_GROUP, Plugins
@@ -47,7 +47,7 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
     if name in METHODS:
         return METHODS[name]
     if name not in METHOD_PLUGINS.names:
-        raise unknown("method", name, all_methods())
+        raise unknown_name("method", name, all_methods())
     make = METHOD_PLUGINS.load(name, Callable)
 
     def make_checked(options: ModelOptions, world: World) -> Method:

@@ -50,7 +50,7 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.utils.progress import counted
+from icrl4aht_data.utils.progress import bar_updater
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import check_target
 
@@ -267,7 +267,7 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
         made = dataset.provenance.get(task.task_id)
         if made is not None and made.references is not None:
             references[played.task_id] = made.references
-    suite = dataset.origin.below(TEAMMATES)
+    suite = dataset.origin.fetch_folder(TEAMMATES)
     root = str(dataset.origin) if isinstance(dataset.origin, Remote) else dataset.root
     return Teammates(list(found.values()), references, suite, root)
 
@@ -327,7 +327,7 @@ def collect_release(
     with atomic_write(begun) as partial:
         write_json(partial, settings)
     total = len(teammates.tasks) * config.histories * config.episodes
-    show, label = counted(progress, f"{agent.name}: episodes", total), labeller and labeller.make
+    show, label = bar_updater(progress, f"{agent.name}: episodes", total), labeller and labeller.make
     by = f"{agent.name}, before the noise" if labeller is None else f"{labeller.name}, in histories of {agent.name}"
     new = []
     for (layout, kind), tasks in grouped(teammates.tasks, lambda task: (task.layout.name, task.teammate_kind)).items():

@@ -44,7 +44,7 @@ from icrl4aht_data.benchmark.best_responses import (
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LAYOUT_NAMES, LEAST_HEADROOM, TESTED_ON, track_of
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import unknown
+from icrl4aht_data.errors import unknown_name
 from icrl4aht_data.utils.files import json_hash, parse_json, read_text
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.templates import markdown_table
@@ -208,7 +208,7 @@ class ResponseJob(EgoJob):
         if self.options.init:
             models = bundled_models()
             if self.options.init not in models:
-                raise unknown("bundled model", self.options.init, models)
+                raise unknown_name("bundled model", self.options.init, models)
             params = read_trained(models[self.options.init].runs[track_of(task.layout.name)]).params
         mate = build_teammate(task.layout, task.teammate)
         played = PlayTask(task.layout, task.teammate_kind, mate, False, task.layout.name)

@@ -26,7 +26,7 @@ from icrl4aht_baselines.agents.host import EgoInput
 from icrl4aht_baselines.evaluate.rollout import EGO_STEPS, TEAMMATE_STEPS
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import unknown
+from icrl4aht_data.errors import unknown_name
 from icrl4aht_data.format.schema import episode_ends
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import EGO, STAY
@@ -119,7 +119,7 @@ def find_partner(name: str, layout: Layout, slot: int) -> Partner:
         policy = build_teammate(layout, task.teammate, slot)
         return Partner(PolicyPlayer(policy, layout, slot, is_ego=False), task)
     if name not in agent_names() and not Path(name).is_dir():
-        raise unknown("partner", name, (HUMAN, *agent_names(), *tests))
+        raise unknown_name("partner", name, (HUMAN, *agent_names(), *tests))
     if slot != EGO:
         layout = _SwappedLayout(**{one.name: getattr(layout, one.name) for one in fields(Layout)})
     return Partner(PolicyPlayer(find_agent(name).make(layout), layout, slot, is_ego=True))

@@ -20,7 +20,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.utils.progress import counted
+from icrl4aht_data.utils.progress import bar_updater
 from icrl4aht_data.utils.system import usable_cores
 
 
@@ -105,7 +105,7 @@ def family_gifs(
         headroom = known_headroom(run.protocol)
         ordered = sorted(run.cells, key=lambda cell: (cell.order[1:], not headroom.get(cell)))
         chosen += [(run, cells[0]) for cells in grouped(ordered, lambda cell: cell[1:]).values()]
-    advance = counted(progress, "episodes of the report", len(chosen))
+    advance = bar_updater(progress, "episodes of the report", len(chosen))
     with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes most of the time
         drawn = [pool.submit(_draw_result, *each, folder / str(number), suite) for number, each in enumerate(chosen)]
         for _ in as_completed(drawn):

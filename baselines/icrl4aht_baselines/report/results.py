@@ -39,7 +39,7 @@ from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, read_tasks_and_layou
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.utils.progress import counted
+from icrl4aht_data.utils.progress import bar_updater
 from icrl4aht_data.utils.text import counted_noun
 
 TEST_LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["test"])
@@ -305,7 +305,7 @@ def evaluate_agent(
             bar is shown.
         what: description for `show`.
     """
-    played = show and counted(show, what, len(tasks) * len(seeds) * protocol.episodes)
+    played = show and bar_updater(show, what, len(tasks) * len(seeds) * protocol.episodes)
     shared: Any = {"seeds": seeds, "out": out, "details": agent.details, "played": played}
     evaluate(agent.name, agent.make, tasks, protocol, **shared, **options)
     note_results(out, agent.run, tasks)

@@ -7,7 +7,7 @@ from typing import Any, SupportsIndex
 import numpy as np
 from numpy.typing import DTypeLike
 
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, unknown_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.channels import CHANNELS
 from icrl4aht_data.overcooked.layouts import Layout
@@ -26,7 +26,7 @@ def check_choices(channels: str, render_mode: str | None = None) -> None:
     """
     for name, value, valid in (("channels", channels, CHANNELS), ("render_mode", render_mode, (None, *RENDER_MODES))):
         if value not in valid:
-            raise unknown(name, value, map(str, valid))
+            raise unknown_name(name, value, map(str, valid))
 
 
 def check_action(name: str, action: SupportsIndex) -> int:

@@ -10,7 +10,7 @@ from itertools import islice
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
-from icrl4aht_data.errors import OptionError, check_choice, unknown
+from icrl4aht_data.errors import OptionError, check_choice, unknown_name
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_generation.layouts.fixtures import LayoutDraw
@@ -53,7 +53,7 @@ def generate_layouts(family: str, seed: int, count: int, *, split: str | None = 
     """
     check_choice("family of layouts", family, LAYOUT_FAMILIES)
     if split not in (None, *LAYOUT_SPLITS):
-        raise unknown("split of layouts", split, LAYOUT_SPLITS)
+        raise unknown_name("split of layouts", split, LAYOUT_SPLITS)
     seed, count = check_int("seed", seed, 0), check_int("count", count, 0)
     if count > MOST_LAYOUTS:
         raise OptionError(f"count = {count}: a family has at most {MOST_LAYOUTS} layouts of one seed; ask for fewer")

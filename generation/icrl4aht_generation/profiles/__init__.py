@@ -12,7 +12,7 @@ from msgspec import Meta, Struct
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS, PREFERENCE_LAYOUTS, REBUILT_SOURCES
 from icrl4aht_data.benchmark.tasks import teammate_id
-from icrl4aht_data.errors import OptionError, check_choice, unknown
+from icrl4aht_data.errors import OptionError, check_choice, unknown_name
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.overcooked.layouts import add_layouts, get_layout
 from icrl4aht_data.utils.options import Count, Natural, replace_options
@@ -108,7 +108,7 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
     """
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.is_file():
-        raise unknown("profile", name, profile_names())
+        raise unknown_name("profile", name, profile_names())
     with _errors_with_path(path):
         profile = _build_profile(path.stem, msgspec.convert(_read_content(path), _ProfileFile))
     prepare(profile)
@@ -293,7 +293,7 @@ def _check_distinct(key: str, names: Sequence[str]) -> tuple[str, ...]:
 def _check_known(what: str, key: str, names: Sequence[str], valid: Sequence[str] | Mapping[str, Any]) -> None:
     for name in names:
         if name not in valid:
-            raise OptionError(f"{key}: {unknown(what, name, valid)}")
+            raise OptionError(f"{key}: {unknown_name(what, name, valid)}")
 
 
 def _layout_names(key: str, names: Sequence[str]) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.files import check_folder_content, process_lock
-from icrl4aht_data.utils.progress import counted, progress_bars
+from icrl4aht_data.utils.progress import bar_updater, progress_bars
 from icrl4aht_data.writing.card import card_facts, print_learning, teammate_name
 from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.jobs.job import FAILED, FailedJobsError
@@ -86,7 +86,9 @@ def build_releases(
         facts = teammate_facts(tasks, artefacts, suite, headroom)
         for kind, release in zip(kinds, releases, strict=True):
             with progress_bars(unit="tasks") as show:
-                steps = (counted(show, f"{step} {kind}", len(tasks)) for step in ("choosing labellers for", "packing"))
+                steps = (
+                    bar_updater(show, f"{step} {kind}", len(tasks)) for step in ("choosing labellers for", "packing")
+                )
                 package_release(artefacts, release, units, profile, suite, kind, facts, left_out, *steps)
         for release in releases:
             print_learning(card_facts(release), console)

@@ -22,7 +22,7 @@ from msgspec import Struct
 
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS, layout_order
 from icrl4aht_data.benchmark.tasks import Task, make_task
-from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice, unknown
+from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice, unknown_name
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, read_lines
 from icrl4aht_data.utils.groups import grouped
@@ -135,7 +135,7 @@ def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
     check_choice("training layout", name, TESTED_ON)
     check_choice("teammate family", family, HEURISTIC_FAMILIES)
     if base_seed not in DRAWS_PER_SEED:
-        raise unknown("base_seed of draws", base_seed, map(str, DRAWS_PER_SEED))
+        raise unknown_name("base_seed of draws", base_seed, map(str, DRAWS_PER_SEED))
     return list(_bundled_draws().get((name, family, base_seed), ()))
 
 

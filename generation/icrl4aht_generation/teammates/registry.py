@@ -14,7 +14,7 @@ import numpy as np
 
 from icrl4aht_data.benchmark.facts import TEAMMATE_PLUGINS
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice, unknown
+from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice, unknown_name
 from icrl4aht_data.format.schema import TEAMMATES
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -157,7 +157,7 @@ def recover_teammate(dataset: Dataset, history_id: int, episode: int = 0) -> Pol
         OptionError: if the release does not contain the teammate's checkpoint.
     """
     entry = dataset.recover_teammate(history_id, episode)
-    if entry["kind"] == "rl" and not dataset.origin.below(f"{TEAMMATES}/{entry['theta']['sha256']}").is_dir():
+    if entry["kind"] == "rl" and not dataset.origin.fetch_folder(f"{TEAMMATES}/{entry['theta']['sha256']}").is_dir():
         raise OptionError(
             f"{dataset.root / TEAMMATES}: no checkpoint {entry['theta']['sha256']}, the teammate of history "
             f"{history_id}; copy the checkpoint from the release that this release was made from"
@@ -189,7 +189,7 @@ def _family(name: str) -> Heuristic:
     if name in HEURISTIC_FAMILIES:
         return HEURISTIC_FAMILIES[name]
     if name not in TEAMMATE_PLUGINS.names:
-        raise unknown("teammate family", name, (*HEURISTIC_FAMILIES, *TEAMMATE_PLUGINS.names))
+        raise unknown_name("teammate family", name, (*HEURISTIC_FAMILIES, *TEAMMATE_PLUGINS.names))
     heuristic = TEAMMATE_PLUGINS.load(name, Heuristic)
     if heuristic.kind != name:
         raise TEAMMATE_PLUGINS.error(name, f"expected kind {name!r}, found {heuristic.kind!r}")

@@ -137,7 +137,9 @@ class TestReleaseWithLayouts:
         load_icrl4aht(root)
         (root / LAYOUTS_FILE).unlink()
         write_manifest(root)
-        with pytest.raises(IndexFormatError, match=r"layout 'mine-3-5' is neither published nor in meta/layouts.jsonl"):
+        with pytest.raises(
+            IndexFormatError, match=r"layout 'mine-3-5' is neither in the benchmark nor in meta/layouts.jsonl"
+        ):
             load_icrl4aht(root)
 
     def test_two_releases_cannot_use_one_name_for_different_maps(self, root):

@@ -192,7 +192,7 @@ def test_conversions_keep_left_out_tasks(lite_release, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"layout": "nowhere"}, "layout 'nowhere' is neither published nor in"),
+        ({"layout": "nowhere"}, "layout 'nowhere' is neither in the benchmark nor in"),
         ({"reason": "\x1b[2J"}, "printable characters"),
     ],
 )

@@ -11,7 +11,7 @@ import pytest
 from rich.progress import Progress
 
 from icrl4aht_data.utils import progress
-from icrl4aht_data.utils.progress import counted, progress_bars, progress_line
+from icrl4aht_data.utils.progress import bar_updater, progress_bars, progress_line
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_progress_lines_are_printed_during_long_steps(monkeypatch, capsys):
 def test_progress_bars_are_shown_on_terminals(monkeypatch, capsys):
     monkeypatch.setenv("FORCE_COLOR", "1")
     with progress_bars(unit="steps") as show:
-        advance = counted(show, "ad", 4)
+        advance = bar_updater(show, "ad", 4)
         advance(3)
         show("ad", 3, 4, "loss 1.234")
     assert "ad: loss 1.234" in capsys.readouterr().err
@@ -69,7 +69,7 @@ def test_progress_bars_are_shown_on_terminals(monkeypatch, capsys):
 
 def test_threads_can_advance_one_progress_bar():
     shown = []
-    advance = counted(lambda *bar: shown.append(bar), "x", 400)
+    advance = bar_updater(lambda *bar: shown.append(bar), "x", 400)
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(advance, [1] * 400))
     assert shown == [("x", done, 400) for done in range(401)]
