@@ -46,34 +46,34 @@ _NOISE = NoiseConfig(histories=64, episodes=100, finish=(0.5, 1.0))
 """Settings of the measured noise histories, which have 640,000 transitions."""
 
 
-class _EnoughError(Exception):
+class _StopCollectionError(Exception):
     """Raised to stop a collection after the measured updates."""
 
 
-def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[str, float]:
+def collect_updates(profile: Profile, updates: int, save_seconds: float) -> dict[str, float]:
     """Collect the profile's last heuristic task, but stop after `updates` updates. Return the timing."""
     work = _last_heuristic_work(profile)
 
     def report(done: int, speed: float) -> None:
         if done == updates:
-            raise _EnoughError
+            raise _StopCollectionError
 
     with tempfile.TemporaryDirectory() as folder:
         job = CollectionJob(work, profile, Path(folder))
-        with suppress(_EnoughError):
+        with suppress(_StopCollectionError):
             job.run(report, save_seconds=save_seconds)
         return last_timing(job.folder) or {}
 
 
 def _last_heuristic_work(profile: Profile) -> Work:
-    """Return the work of collecting the profile's last task that has a heuristic teammate."""
+    """Return the unit of work that collects the profile's last task with a heuristic teammate."""
     return replace(profile, presets=("default",)).units()[-1]
 
 
 def collection_speed(profile_name: str, updates: int) -> dict[str, Any]:
     """Return the speed of a collection that saves its state every two seconds, 15 times as often as usual."""
     profile = load_profile(profile_name)
-    timing = collect_some(profile, updates, save_seconds=2)
+    timing = collect_updates(profile, updates, save_seconds=2)
     return {
         "profile": profile_name,
         "environments": profile.ego.environments,
@@ -104,17 +104,17 @@ def collection_memory(updates: int) -> dict[str, Any]:
     peaks = []
     for recording in (False, True):
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
-            peaks.append(round(process.submit(peak_of_learning, updates, recording).result()))
+            peaks.append(round(process.submit(measure_peak_memory, updates, recording).result()))
     return {"environments": 1024, "updates": updates, "learner_peak_mib": peaks[0], "collection_peak_mib": peaks[1]}
 
 
-def peak_of_learning(updates: int, recording: bool) -> float:
+def measure_peak_memory(updates: int, recording: bool) -> float:
     """Return this process's peak memory in MiB after learning, or after collecting and saving at every update."""
     profile = load_profile("paper")
     # The number of environments and the rollout length, not the network, determine the memory: a small network is fast.
     profile = replace(profile, ego=replace(profile.ego, widths=Widths((4,), (4,), 8, 8, 8)))
     if recording:
-        collect_some(profile, updates, save_seconds=0)
+        collect_updates(profile, updates, save_seconds=0)
         return peak_memory()
     learner = make_learner(_last_heuristic_work(profile).task, profile)
     state, update = jax.jit(learner.init)(jax.random.key(0)), jax.jit(learner.update, donate_argnums=0)

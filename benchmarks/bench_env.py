@@ -32,7 +32,7 @@ from icrl4aht_generation.env import Environment
 from icrl4aht_generation.layouts.families import generate_layouts
 from icrl4aht_generation.learners.config import PPOConfig
 
-from benchmarks.harness import compared, print_line, rates_in_turn
+from benchmarks.harness import compare_rates, measure_rates, print_line
 from benchmarks.peers import jaxmarl_environment, jaxmarl_training
 from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -119,9 +119,9 @@ def print_layouts(n: int, rounds: int) -> None:
         "one": rollout(our_game(one, n, "uint8", canonical=True), n),
         "jaxmarl": rollout(peer_game(one, n, "uint8"), n),
     }
-    rates = rates_in_turn(ways, STEPS // n * n, rounds)
-    of_one = compared(rates, "ours", "one")["ratio"]
-    facts = {"one_layout": one.name, "ratio_to_one_layout": of_one, **compared(rates, "ours", "jaxmarl")}
+    rates = measure_rates(ways, STEPS // n * n, rounds)
+    of_one = compare_rates(rates, "ours", "one")["ratio"]
+    facts = {"one_layout": one.name, "ratio_to_one_layout": of_one, **compare_rates(rates, "ours", "jaxmarl")}
     print_line("env", part="layouts", layouts=len(many), environments=n, written="uint8", **facts)
 
 
@@ -154,13 +154,13 @@ def main(
                     "ours": rollout(our_game(layout, n, what), n),
                     "jaxmarl": rollout(peer_game(layout, n, what), n),
                 }
-                facts = compared(rates_in_turn(ways, STEPS // n * n, rounds), "ours", "jaxmarl")
+                facts = compare_rates(measure_rates(ways, STEPS // n * n, rounds), "ours", "jaxmarl")
                 print_line("env", part="steps", layout=layout.name, environments=n, written=what, **facts)
             continue
         config = PPOConfig(UPDATES * n * steps, n, steps, minibatches=min(n, 8), warmup=0.05)
         both = {"ours": JaxMARLEnv(layout.name), "jaxmarl": jaxmarl_environment(layout)}
         ways = {name: jaxmarl_training(peer, env, config, UPDATES) for name, env in both.items()}
-        facts = compared(rates_in_turn(ways, config.total_steps, rounds), "ours", "jaxmarl")
+        facts = compare_rates(measure_rates(ways, config.total_steps, rounds), "ours", "jaxmarl")
         print_line("env", part="ippo", layout=layout.name, environments=n, rollout=steps, updates=UPDATES, **facts)
 
 

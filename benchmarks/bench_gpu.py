@@ -193,7 +193,7 @@ def measure_training(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) 
                 raise
             reason = str(error)
         parts *= 2  # not in the except block, where the arrays of the failed attempt are still in memory
-    raise MemoryError(f"the batch does not fit in any number of parts: {reason}")
+    raise MemoryError(f"the batch does not fit into memory, however many parts it has: {reason}")
 
 
 def _training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, parts: int) -> dict[str, Any]:
@@ -250,7 +250,7 @@ def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) ->
     compile_seconds = time.perf_counter() - started
     episodes = play_episodes(prepared)
     filling, shortest = -(-context // sizes.episode_steps), 2 * -(-context // 5 // sizes.episode_steps)
-    for _ in islice(episodes, filling):  # fills the windows; then a fifth of a window is dropped regularly
+    for _ in islice(episodes, filling):  # fills the windows; full windows drop a fifth of their steps
         pass
     seconds = seconds_of_calls(partial(next, episodes), sizes.seconds, least=max(3, shortest))
     streams, episode_seconds = len(tasks) * seeds, statistics.mean(seconds)
@@ -305,7 +305,7 @@ def run_case(name: str, sizes: Sizes) -> bool:
     """Measure a case, and print its line. Return whether it succeeded."""
     try:
         facts = CASES[name](sizes)
-    except Exception as error:  # the other cases are measured even so
+    except Exception as error:  # a failed case does not prevent the others
         print_case(name, {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"[:400]})
         return False
     print_case(name, facts)
@@ -319,7 +319,7 @@ def print_case(case: str, facts: Mapping[str, Any]) -> None:
 
 
 def stop_at_limit(pending: Sequence[str]) -> None:
-    """Print a line for each case without a result, then end the process, as a running case cannot be interrupted."""
+    """Print an error line for each unfinished case, and end the process, since a running case cannot be interrupted."""
     for name in pending:
         print_case(name, {"error": "no time left"})
     os._exit(1)

@@ -46,7 +46,7 @@ from icrl4aht_generation.teammates.instances import published_tasks
 from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
 from benchmarks.bench_loader import published_reader
-from benchmarks.harness import compared, compiled_call, elapsed, print_line, rates_in_turn
+from benchmarks.harness import compare_rates, compiled_call, elapsed, measure_rates, print_line
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task
@@ -85,10 +85,10 @@ def compare_egos(layout: Layout, configs: dict[str, PPOConfig], rounds: int) -> 
     """Print steps/s of training an ego with each profile, and the ratio to the first profile."""
     ways = {name: ego_updates(layout, config) for name, config in configs.items()}
     steps = {name: _UPDATES * config.steps_per_update for name, config in configs.items()}
-    rates, first = rates_in_turn(ways, steps, rounds), next(iter(configs))
+    rates, first = measure_rates(ways, steps, rounds), next(iter(configs))
     for name, config in configs.items():
         sizes = {size: getattr(config, size) for size in ("environments", "rollout", "minibatches", "epochs")}
-        facts = sizes | {"encoder": config.widths.encoder, "threads": xla_threads()} | compared(rates, name, first)
+        facts = sizes | {"encoder": config.widths.encoder, "threads": xla_threads()} | compare_rates(rates, name, first)
         _print(part="ego", profile=name, layout=layout.name, **facts)
 
 
@@ -100,17 +100,19 @@ def compare_jaxmarl(script: Path, layout: Layout, environments: int, rounds: int
     words = replace(config, widths=replace(config.widths, encoder="words"))
     population = Population(Environment(layout), FCP(1), words)
 
-    def train_through(key: Any) -> Any:
+    def train_to_the_end(key: Any) -> Any:
         start = population.init(key)
         return jax.lax.scan(lambda state, _: population.update(state), start, length=_PEER_UPDATES)
 
     ways = {
-        "ours": compiled_call(train_through, jax.random.key(0)),
+        "ours": compiled_call(train_to_the_end, jax.random.key(0)),
         "jaxmarl": jaxmarl_training(script, jaxmarl_environment(layout), config, _PEER_UPDATES),
     }
-    rates = rates_in_turn(ways, _PEER_UPDATES * config.steps_per_update, rounds)
+    rates = measure_rates(ways, _PEER_UPDATES * config.steps_per_update, rounds)
     sizes = {name: getattr(config, name) for name in ("environments", "rollout", "minibatches")}
-    _print(part="jaxmarl", layout=layout.name, threads=xla_threads(), **sizes, **compared(rates, "ours", "jaxmarl"))
+    _print(
+        part="jaxmarl", layout=layout.name, threads=xla_threads(), **sizes, **compare_rates(rates, "ours", "jaxmarl")
+    )
 
 
 def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
@@ -137,7 +139,7 @@ def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
 
 
 def ad_method(size: str, layouts: Sequence[Layout], view: BatchView | None = None, **changes: Any) -> Method:
-    """Return the method AD of a model size on some layouts, perhaps with other options of the model."""
+    """Return the method AD of a model size on some layouts; `changes` replace options of the size."""
     model = ModelOptions(**SIZES[size].model | changes)
     return get_method("ad")(model, overcooked_world(layouts, model.encoder, view))
 
@@ -174,10 +176,10 @@ def compare_training(
             else:
                 batches = loaders[way] = opened.enter_context(trainer.batches(sampler, 0, sys.maxsize))
             ways[way] = training_steps(trainer, batches, steps)
-        rates = rates_in_turn(ways, steps * options.batch_size * options.context, rounds)
+        rates = measure_rates(ways, steps * options.batch_size * options.context, rounds)
     for way in encoders:
         sizes = {"batch": options.batch_size, "length": options.context, "wait_seconds": round(loaders[way].waited, 3)}
-        _print(part="ad", size=size, encoder=way, **sizes, **compared(rates, way, "published"))
+        _print(part="ad", size=size, encoder=way, **sizes, **compare_rates(rates, way, "published"))
 
 
 def untrained_ad(layout: Layout, size: str, acting: Acting) -> Policy:
@@ -203,8 +205,8 @@ def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int
     dropped = dropped_steps(SIZES[size].train["context"])  # number of steps after which the window is computed again
     lengths: dict[Acting, int] = {"cached": dropped * -(-10 * steps // dropped), "exact": steps}
     ways = {acting: acting_steps(tasks, size, acting, n) for acting, n in lengths.items()}
-    rates = rates_in_turn(ways, {acting: n * len(tasks) for acting, n in lengths.items()}, rounds)
-    _print(part="act", size=size, tasks=len(tasks), **compared(rates, "cached", "exact"))
+    rates = measure_rates(ways, {acting: n * len(tasks) for acting, n in lengths.items()}, rounds)
+    _print(part="act", size=size, tasks=len(tasks), **compare_rates(rates, "cached", "exact"))
 
 
 def evaluate_all_tasks(size: str, protocol: Protocol) -> None:

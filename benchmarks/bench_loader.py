@@ -27,7 +27,7 @@ import click
 import h5py
 import numpy as np
 
-from benchmarks.harness import compared, elapsed, print_line
+from benchmarks.harness import compare_rates, elapsed, print_line
 from icrl4aht_data import ADBatch, ADSampler, Dataset, load_icrl4aht
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.options import COUNT
@@ -77,7 +77,7 @@ def published_reader(folder: Path, length: int) -> ReadWindows:
 
 
 def fair_reader(folder: Path, length: int, batch: int) -> ReadWindows:
-    """Return the fair peer of our loader, which uses h5py in a way that suits random windows.
+    """Return a reader that is a fair peer of our loader: it uses h5py in a way that suits random windows.
 
     Unlike the published reader, it reads files with chunks as long as a window, and fills one reused buffer.
     """
@@ -136,7 +136,7 @@ def batch_seconds(sampler: ADSampler, buffer: ADBatch | None, cache: str, first:
 
 
 def compare_readers(folder: Path, batch: int, length: int, rounds: int, threads: int, peer_windows: int) -> None:
-    """Compare our samplers to both peers, for each cache and form of observations."""
+    """Compare our sampler with the published and the fair reader, for each cache and form of observations."""
     dataset: Any = load_icrl4aht(folder / "lite", threads=threads)
     windows_of = dataset.ad(batch_size=batch, length=length, seed=1).windows
     peers = {
@@ -163,7 +163,9 @@ def compare_readers(folder: Path, batch: int, length: int, rounds: int, threads:
             rates[cache, obs].append(batch / batch_seconds(sampler, buffer, cache, 1000 * number + 1))
     for (cache, obs), peer in product(samplers, peers):
         aim = {"least_ratio": _AIMS.get((cache, obs))} if peer == "published" else {}
-        print_line("loader", part="read", cache=cache, obs=obs, peer=peer, **compared(rates, (cache, obs), peer), **aim)
+        print_line(
+            "loader", part="read", cache=cache, obs=obs, peer=peer, **compare_rates(rates, (cache, obs), peer), **aim
+        )
 
 
 @click.command()

@@ -30,10 +30,10 @@ def elapsed(work: Callable[[], Any]) -> float:
     return time.perf_counter() - started
 
 
-def rates_in_turn(
+def measure_rates(
     ways: Mapping[str, Callable[[], Any]], steps: float | Mapping[str, float], rounds: int
 ) -> dict[str, list[float]]:
-    """Measure implementations in turn. Return name of an implementation -> steps/s in each round.
+    """Measure implementations in turn. Return the steps/s of each implementation in each round, by name.
 
     Args:
         ways: name of an implementation -> compiled function that waits for its result.
@@ -47,7 +47,7 @@ def rates_in_turn(
     return rates
 
 
-def compared(rates: Mapping[Any, list[float]], way: Any, peer: str) -> dict[str, float]:
+def compare_rates(rates: Mapping[Any, list[float]], way: Any, peer: str) -> dict[str, float]:
     """Return median steps/s of an implementation and its peer, and median, minimum and maximum of their ratio."""
     ratios = [ours / theirs for ours, theirs in zip(rates[way], rates[peer], strict=True)]
     facts = {

@@ -139,7 +139,7 @@ class Dataset(Selection):
 
     @property
     def has_tasks(self) -> bool:
-        """Whether the release stores its tasks; a release of observations may not store them."""
+        """Whether the release stores its tasks, which are optional in a release of observations."""
         return self.has_states or bool(self.tasks)
 
     def sort(self, *names: str, reverse: bool = False) -> Self:
@@ -428,7 +428,7 @@ def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | No
             spans = dataset.index.entry(history_id).teammate_of_episode
             found |= {name for _, name in spans or ((0, teammate_id(dataset.recover_teammate(history_id))),)}
         return sorted(found)
-    except (NotStoredError, UnknownNameError):  # a release of observations may not contain its tasks
+    except (NotStoredError, UnknownNameError):  # tasks are optional in a release of observations
         return None
 
 

@@ -148,7 +148,7 @@ def check_choice(what: str, found: object, valid: Iterable[str]) -> None:
         raise unknown_name(what, found, valid)
 
 
-_LISTED, _COMPARED = 50, 1000  # maximum number of valid names to list, and to compare with the wrong one
+_LISTED, _COMPARED = 50, 1000  # maximum number of valid names to list, and to compare with an unknown name
 
 
 def unknown_name(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:

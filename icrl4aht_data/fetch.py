@@ -216,7 +216,7 @@ class Remote(ReleaseLocation):
     @cached_property
     def manifest(self) -> dict[str, str]:
         """SHA-256 of each file, hexadecimal, by path in the release."""
-        return dict(read_manifest(self.folder))  # a dict can be pickled
+        return dict(read_manifest(self.folder))  # unlike a MappingProxyType, a dict can be pickled
 
     @cached_property
     def _shard_sizes(self) -> dict[str, int]:

@@ -34,7 +34,7 @@ from icrl4aht_data.utils.progress import progress_bars
 
 DEMO_LAYOUT = "rooms-0-46"
 _SOURCE = "search"
-_EPISODES = 5  # episodes of a window, in which the script of the histories finds out the dish
+_EPISODES = 5  # episodes of a window; within them, the script `search` finds out which dish is wanted
 
 _MODEL = ModelOptions(
     width=128, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05
@@ -120,7 +120,7 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> Path:
         job.train(run, done=show_steps(show, "Hybrid-AD", training.steps))
     click.echo(f"losses on training and held-out histories: {run / RUN_CURVES}")
 
-    every = bundled_tasks(PREFERENCE, "validation")  # new teammates, but the dishes of training
+    every = bundled_tasks(PREFERENCE, "validation")  # their teammates are new, their dishes are those of the training
     tasks = settings.tasks or [task for task in every if task.layout.name == DEMO_LAYOUT]
     print_stage(5, f"evaluating it and {', '.join(_AGENTS)} on {len(tasks)} validation tasks")
     agent = find_agent(run, greedy=False)
@@ -159,7 +159,7 @@ def conclusion(own: EvaluationRun, cleared: EvaluationRun) -> str:
 
 
 def draw_adaptation(runs: Sequence[EvaluationRun], path: Path) -> None:
-    """Draw each run's mean return in every episode; the model with its memory cleared has a dashed line."""
+    """Draw each run's mean return in every episode; a dashed line shows the model with its memory cleared."""
     figure, (axes,) = panel_grid(
         [f"{DEMO_LAYOUT}, validation teammates: one dish is wanted, and nothing shows which"],
         1,

@@ -46,7 +46,7 @@ def measure_headroom(out: Path, protocols: Sequence[str]) -> list[EvaluationRun]
 
 
 def find_equal_teammates() -> list[list[str]]:
-    """Return groups of ids of test tasks in which the teammates behave the same; each group has two ids or more."""
+    """Return groups of test tasks whose teammates behave the same, as lists of at least two task ids."""
     tasks = [task for track in TRACKS for task in bundled_tasks(track, "test")]
     return [[task.task_id for task in alike] for alike in find_behaviours(tasks) if len(alike) > 1]
 
@@ -100,7 +100,7 @@ def headroom_markdown(protocols: Mapping[str, HeadroomCells]) -> str:
 
 
 def published_table(layouts: HeadroomCells) -> str:
-    """Return a Markdown table of mean returns on each layout, of the reference egos and the paper's methods.
+    """Return a Markdown table with the mean returns of the reference egos and the paper's methods on each layout.
 
     Args:
         layouts: returns of the reference egos under the protocol `published`.

@@ -53,7 +53,7 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
 def panel_grid(
     titles: Sequence[str], columns: int, size: tuple[float, float], x_label: str, **sharing: Any
 ) -> tuple[Any, list[Any]]:
-    """Return a figure and its axes: a panel for each title, of a size in inches, and hidden panels in the last row."""
+    """Return a figure and its axes: one panel of `size` inches for each title; the last row may have hidden panels."""
     rows = -(-len(titles) // columns)
     figure = new_figure(size[0] * columns + 0.3, size[1] * rows + 0.6)
     grid: list[Any] = [*figure.subplots(rows, columns, squeeze=False, **sharing).flat]
@@ -77,7 +77,7 @@ def _plot_log_curve(axes: Any, label: str, color: str, points: pd.Series) -> Non
 
 
 def shrink_picture(picture: Path, path: Path) -> None:
-    """Write a copy of a PNG file with 64 colours: curves look the same in a third of the bytes."""
+    """Write a copy of a PNG file with 64 colours: curves look the same, and the file is a third as large."""
     from PIL import Image
 
     with Image.open(picture) as image:

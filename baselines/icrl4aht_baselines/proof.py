@@ -22,7 +22,7 @@ from icrl4aht_generation.learners.resume import TIMING
 from icrl4aht_baselines.agents.egos import NamedEgo, find_agent
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
-from icrl4aht_baselines.online.responses import with_headroom
+from icrl4aht_baselines.online.responses import tasks_with_headroom
 from icrl4aht_baselines.report.results import evaluate_agent
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.training.job import TrainingJob
@@ -68,15 +68,18 @@ LEARNERS = {
 """Name on the command line and in folders -> learner."""
 
 _MODEL = ModelOptions(**{**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0})
-# The script `search` finds out the dish within these first episodes, so windows begin at a history's start.
+# The script `search` finds out which dish is wanted in its first episodes, so models train on these.
 _FIRST_EPISODES = 5
 _TRAINING: dict[str, Any] = {"learning_rate": 2e-3, "validate_every": 10**6, "save_every": 10**6, "log_every": 20}
 
 
 def proof_tasks() -> dict[str, tuple[Task, ...]]:
-    """Return the validation tasks that have headroom, of the tracks preference and teammate."""
+    """Return the validation tasks of the track preference, and those of the track teammate that have headroom."""
     played = [*bundled_tasks(TEAMMATE_TRACK, "validation"), *bundled_tasks(TEAMMATE_TRACK, "diverse")]
-    return {PREFERENCE: tuple(bundled_tasks(PREFERENCE, "validation")), TEAMMATE_TRACK: tuple(with_headroom(played))}
+    return {
+        PREFERENCE: tuple(bundled_tasks(PREFERENCE, "validation")),
+        TEAMMATE_TRACK: tuple(tasks_with_headroom(played)),
+    }
 
 
 @dataclass(frozen=True)
@@ -135,12 +138,12 @@ class ProofJob(TrainingJob):
 
     @property
     def first(self) -> int:
-        """Number of first episodes of each history to train on; 0 for all episodes."""
+        """Number of episodes to train on at the start of each history; 0 for all episodes."""
         return _FIRST_EPISODES if self.source in ("search", "all") else 0
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All settings that the result depends on, as JSON; the content of the release is not among them."""
+        """All settings that the result depends on, as JSON, except the content of the release."""
         tasks = {name: [task.task_id for task in own] for name, own in self.options.tasks.items()}
         return {"train": asdict(self.training), "root": self.options.root, "tasks": tasks, "first": self.first}
 
@@ -231,6 +234,6 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
 
 
 def run_references(options: ProofOptions, out: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Return name of an ego in `COMPARED_EGOS` -> returns from `play_sets`; stored results are reused."""
+    """Return the returns from `play_sets` of each ego in `COMPARED_EGOS`, by name; stored results are reused."""
     names = dict.fromkeys(name for of_set in COMPARED_EGOS.values() for name in of_set)
     return {name: play_sets(find_agent(name), options, out / "references" / name, controls=False) for name in names}

@@ -148,24 +148,26 @@ class ReferenceOutcome(NamedTuple):
 
 
 def check_learns_from_teacher(name: str) -> None:
-    """Check that a reference model learns from histories of a teacher, so that a teacher may be chosen.
+    """Check that a reference model learns from histories of a teacher, as the choice of a teacher requires.
 
     Raises:
         OptionError: if the model learns by playing.
     """
     if not RECIPES[name].data:
         taught = ", ".join(each for each, recipe in RECIPES.items() if recipe.data)
-        raise OptionError(f"{name} does not learn from a teacher's histories; leave it out, or choose one of {taught}")
+        raise OptionError(
+            f"{name} does not learn from a teacher's histories; leave out --teacher, or choose another --name: {taught}"
+        )
 
 
 @dataclass(frozen=True)
 class ReferenceMaker:
-    """Maker of the reference models of a track. A step is skipped if its output exists.
+    """Maker of the reference models of a track. Models and releases that exist already are reused.
 
     Attributes:
         track: name of the track.
         out: output folder; its content is described at the top of this module.
-        show: function for progress, called with (description, units done, units, note).
+        show: function for progress, called with (description, units done, total units, note).
         teacher: name or run folder of the agent that plays and labels the histories, such as `rl2-reference`; if None,
             RL^2 is trained first. Existing releases and runs are reused, even if made with another teacher.
     """
@@ -209,7 +211,7 @@ class ReferenceMaker:
         return folder / "lite"
 
     def teammates(self, number: int = 0) -> Any:
-        """Return the teammates of the noise histories on the track's layouts, and diverse teammates.
+        """Return the teammates of the noise histories on the track's layouts, and those of `diverse_tasks`.
 
         Args:
             number: number of the collection, which determines the seeds of the tasks, see `release_teammates`.
@@ -218,7 +220,7 @@ class ReferenceMaker:
         return release_teammates(noise, number, self.diverse_tasks())
 
     def diverse_tasks(self) -> list[Task]:
-        """Return the training tasks with diverse teammates."""
+        """Return the bundled training tasks of the track with diverse teammates."""
         return read_tasks(manifest_path(self.track, "train", "diverse"))
 
     def train_by_playing(self) -> Path:
@@ -241,7 +243,7 @@ class ReferenceMaker:
         return folder
 
     def train(self, recipe: Recipe, root: Path, folder: Path, before: Path | None = None) -> None:
-        """Train a model on a release, from the parameters of the run `before` at a lower learning rate if given."""
+        """Train a model on a release; with `before`, start from that run's parameters, at a lower learning rate."""
         options = TrainOptions(**recipe.train)
         if before:
             options = replace(options, learning_rate=OWN_SHARE * options.learning_rate)
@@ -252,7 +254,7 @@ class ReferenceMaker:
         job.train(folder, params=params, done=show_steps(self.show, folder.name, options.steps))
 
     def add_own_histories(self, histories: Path, first: Path, run: Path) -> Path:
-        """Record histories of a model, labelled by the teacher. Return a release of these and the given histories."""
+        """Record histories of a model, labelled by the teacher. Return a release that adds them to `histories`."""
         own, mixed = (run.with_name(f"{run.name}-{kind}") for kind in ("own", "mixed"))
         if not mixed.is_dir():
             if not own.is_dir():
@@ -263,7 +265,7 @@ class ReferenceMaker:
         return mixed
 
     def evaluate(self, name: str, run: Path, recipe: Recipe) -> dict[str, Path]:
-        """Evaluate a model. Return name in `EVALUATIONS` -> folder of results."""
+        """Evaluate a model. Return the folder of results for each name in `EVALUATIONS`."""
         model, agent = f"{name}-{self.track}", find_agent(run, greedy=recipe.greedy)._replace(name=name)
         found = {kind: self.out / "results" / model / kind for kind in EVALUATIONS}
         for kind, (split, protocol, seeds) in EVALUATIONS.items():
@@ -281,7 +283,7 @@ def write_bundled_card(
         name: name of the bundled model.
         outcomes: evaluated outcomes of the model's tracks.
         folder: folder of the bundled models.
-        teacher: agent that the histories were recorded of, see `ReferenceMaker`.
+        teacher: agent that played the training histories, see `ReferenceMaker`.
     """
     (run,) = merge([read_run(found.results["test-seeded"]) for found in outcomes])
     validation = merge([read_run(found.results[kind]) for found in outcomes for kind in ("validation", "diverse")])

@@ -135,7 +135,7 @@ def generate(
 
 
 def _profile_with_threads(name: str, threads: int | None) -> Profile:
-    """Load a profile by name, and limit XLA to the given number of threads, or else to the profile's."""
+    """Load a profile by name, and limit XLA to the given number of threads, by default the profile's number."""
     from icrl4aht_generation.learners.resume import limit_xla_threads
     from icrl4aht_generation.profiles import load_profile
 
@@ -191,10 +191,10 @@ def layouts(
         save_figure(plot_layouts(found, titles), out)
     delivered = [None] * count
     if check:
-        from icrl4aht_generation.layouts.playable import layouts_delivered
+        from icrl4aht_generation.layouts.playable import are_playable
 
         with progress_bars(unit="layouts") as show:
-            delivered = layouts_delivered(found, bar_updater(show, "check", count)).tolist()
+            delivered = are_playable(found, bar_updater(show, "check", count)).tolist()
     rows, lines = [], []
     for layout, one in zip(found, delivered, strict=True):
         row = {
@@ -326,9 +326,10 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
     """Sample heuristic teammates for tasks, and measure them.
 
     Samples parameters from the training ranges and from wider ranges (diverse): for each layout and family 32 teammates
-    for training and 8 for validation. Writes for each teammate which test teammate behaves most similarly, and the
-    returns of the egos stay, random and oracle with it. With --spread, chooses widely different teammates for
-    tasks.spread of the profiles. A stopped command resumes: layouts that the table already contains are skipped.
+    for training and 8 for validation. Writes for each teammate the test teammate with the most similar behaviour, and
+    the returns of the egos stay, random and oracle with the new teammate. With --spread, chooses widely different
+    teammates for tasks.spread of the profiles. A stopped command resumes: layouts that the table already contains are
+    skipped.
     """
     import pandas as pd
 

@@ -86,7 +86,7 @@ class Environment:
 
     @cached_property
     def tables(self) -> Tables:
-        """Tables of the only layout, or stacked tables of several layouts."""
+        """Tables of the environment's layout, or stacked tables of its several layouts."""
         if isinstance(self.layout, Tables):
             return self.layout
         if not isinstance(self.layout, Layout):
@@ -101,11 +101,11 @@ class Environment:
             TypeError: if the environment has several layouts, or only tables.
         """
         if not isinstance(self.layout, Layout):
-            raise TypeError("expected an environment of one layout, found several layouts or only tables")
+            raise TypeError("expected an environment of one layout, found several layouts or only a layout's tables")
         return self.layout
 
     def init(self, keys: Key[Array, " N"], layout: Int[Array, " N"] | None = None) -> EnvState:
-        """Return the start of the first episode of each environment.
+        """Return the states at the start of the first episode of each environment.
 
         Args:
             keys: typed JAX keys (N,), or raw keys, uint32 (N, 2).
@@ -126,25 +126,25 @@ class Environment:
     def step(self, state: EnvState, actions: Int[Array, "N 2"]) -> EnvStep:
         """Play one step in every environment; environments with a finished episode start their next episode."""
         clock = state.clock + 1
-        outcome: rules.StepResult = self.on_tables(
+        outcome: rules.StepResult = self.call_with_tables(
             rules.step, state.layout, state.record, actions, self.next_recipe(state)
         )
         done = clock >= self.max_steps
         episode = state.episode + done
 
-        def restarted() -> tuple[Array, Array | None]:
+        def restart_ended() -> tuple[Array, Array | None]:
             layout = state.layout
             if self.redraws and layout is not None:
                 layout = jnp.where(done, self._random_layout(state.key, episode), layout)
             first = self.first_record(state.key, episode, layout)
             return jnp.where(done[:, None], first, outcome.state), layout
 
-        # In most steps no episode ends: one condition for the whole batch avoids the cost of the reset.
-        record, layout = jax.lax.cond(jnp.any(done), restarted, lambda: (outcome.state, state.layout))
+        # In most steps no episode ends, so one condition for the whole batch saves the cost of resets.
+        record, layout = jax.lax.cond(jnp.any(done), restart_ended, lambda: (outcome.state, state.layout))
         after = EnvState(state.key, episode, jnp.where(done, 0, clock), record, layout)
         return EnvStep(after, outcome.reward, outcome.shaped, done, outcome.state)
 
-    def on_tables(self, function: Callable[..., Any], layout: Int[Array, " N"] | None, *arguments: Array) -> Any:
+    def call_with_tables(self, function: Callable[..., Any], layout: Int[Array, " N"] | None, *arguments: Array) -> Any:
         """Call a function with the layout tables of every environment and further arrays.
 
         Args:
@@ -158,7 +158,7 @@ class Environment:
 
     def tables_of(self, layout: Int[Array, ""] | None) -> Tables:
         """Return the tables of a layout by its number, or of the only layout for None."""
-        # The compiler fuses this gather with later ones, so the environments hold no copies of the tables.
+        # The compiler fuses this gather with later gathers, so no environment has its own copy of the tables.
         return self.tables if layout is None else jax.tree.map(lambda leaf: jnp.asarray(leaf)[layout], self.tables)
 
     def act(
@@ -172,7 +172,7 @@ class Environment:
         *,
         own: bool,
     ) -> tuple[Int[Array, " N"], Any]:
-        """Return the actions of a policy as one agent of every environment, and the policy's memories after the step.
+        """Return a policy's actions for one agent of every environment, and the policy's memories after the step.
 
         Args:
             policy: policy that chooses the actions.
@@ -202,43 +202,45 @@ class Environment:
             state: the environments' states.
             canonical: whether to return the canonical channels, which mean the same on all layouts.
         """
-        return self.on_tables(partial(observe_both, canonical=canonical), state.layout, state.record)
+        return self.call_with_tables(partial(observe_both, canonical=canonical), state.layout, state.record)
 
     def observe_one(self, state: EnvState, agent: int, canonical: bool = False) -> UInt8[Array, "N 5 5 C"]:
         """Return the observations of one agent: 0 for the ego, 1 for the teammate."""
-        return self.on_tables(partial(observe, agent=agent, canonical=canonical), state.layout, state.record)
+        return self.call_with_tables(partial(observe, agent=agent, canonical=canonical), state.layout, state.record)
 
     def next_recipe(self, state: EnvState) -> UInt8[Array, " N"]:
-        """Return the item of the recipe that becomes current if this step makes a correct delivery."""
-        keys = _fold(self.episode_key(state), state.clock + 1)
-        return self.on_tables(_random_recipe, state.layout, keys)
+        """Return the item byte of the recipe that becomes current if this step makes a correct delivery."""
+        keys = _fold_in(self.episode_key(state), state.clock + 1)
+        return self.call_with_tables(_random_recipe, state.layout, keys)
 
     def episode_key(self, state: EnvState) -> Key[Array, " N"]:
         """Return the key of each running episode, which depends only on the environment's key and the episode's number.
 
-        The environment folds 0 into this key to draw the start of the episode, the number of a step that delivers a
-        soup (counted from 1) to draw the next recipe, and `_LAYOUT_DRAW` to draw a layout. No soup is delivered before
-        step 22, because a pot cooks for 20 steps, so policies may fold in 1..20 for draws of their own.
+        The environment folds a number into this key for each draw: 0 for the start of the episode, `_LAYOUT_DRAW` for a
+        layout, and the number of a step (counted from 1) for the recipe after a delivery in this step. No soup is
+        delivered before step 22, because a pot cooks for 20 steps, so policies may fold in 1..20 for their own draws.
 
         `policy_player` gives the policy of agent 0 the key with 0 folded in, from which the start is also drawn.
         """
-        return _fold(state.key, state.episode)
+        return _fold_in(state.key, state.episode)
 
     def first_record(
         self, keys: Key[Array, " N"], episode: Int[Array, " N"], layout: Int[Array, " N"] | None = None
     ) -> UInt8[Array, "N S"]:
         """Return state records at the start of episodes.
 
-        Recipe and facings are uniformly random. First the ego, then the teammate starts on a random free cell of its
-        room.
+        Recipe and facings are uniformly random. The ego starts on a random cell of its room, and the teammate on a
+        random free cell of its room.
         """
-        draw = jax.vmap(lambda key: jax.random.split(key, 5))(_fold(_fold(keys, episode), jnp.zeros_like(episode)))
-        return self.on_tables(_first_record, layout, draw)
+        draw = jax.vmap(lambda key: jax.random.split(key, 5))(
+            _fold_in(_fold_in(keys, episode), jnp.zeros_like(episode))
+        )
+        return self.call_with_tables(_first_record, layout, draw)
 
     def _random_layout(self, keys: Key[Array, " N"], episode: Int[Array, " N"]) -> Int[Array, " N"]:
         """Return a random layout number for the given episode of each environment."""
         return _random_below(
-            _fold(_fold(keys, episode), jnp.full_like(episode, _LAYOUT_DRAW)), np.uint32(len(self.tables.kinds))
+            _fold_in(_fold_in(keys, episode), jnp.full_like(episode, _LAYOUT_DRAW)), np.uint32(len(self.tables.kinds))
         )
 
 
@@ -248,7 +250,7 @@ _LAYOUT_DRAW = 2**31 - 1
 
 def _first_record(tables: Tables, draw: Key[Array, "*N 5"]) -> UInt8[Array, "*N S"]:
     (ego_room, mate_room), (ego_cells, mate_cells) = jnp.asarray(tables.rooms), jnp.asarray(tables.room_sizes)
-    # In a shared room the teammate cannot start on the ego's cell, so its number skips that cell.
+    # In a shared room, the ego's cell is not free, so the teammate's random number skips this cell.
     one_room = jnp.all(ego_room == mate_room) & (ego_cells == mate_cells)
     ego_number = _random_below(draw[..., 0], ego_cells)
     mate_number = _random_below(draw[..., 1], mate_cells - one_room)
@@ -262,7 +264,7 @@ def _random_recipe(tables: Tables, keys: Key[Array, "*N"]) -> UInt8[Array, "*N"]
     return jnp.asarray(tables.recipes)[_random_below(keys, jnp.asarray(tables.recipe_count))]
 
 
-def _fold(keys: Key[Array, " N"], data: Int[Array, " N"]) -> Key[Array, " N"]:
+def _fold_in(keys: Key[Array, " N"], data: Int[Array, " N"]) -> Key[Array, " N"]:
     return jax.vmap(jax.random.fold_in)(keys, data)
 
 

@@ -255,7 +255,7 @@ class Index:
 
         Args:
             name: name of the field, one of `QUERY_FIELDS`.
-            value: the wanted value, which the release may not have.
+            value: the wanted value, which need not occur in the release.
             given: name of the field in messages.
         """
         if name == "layout":

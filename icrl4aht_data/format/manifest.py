@@ -114,7 +114,7 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
 
 
 def check_meta(root: Path) -> None:
-    """Check those of `INDEX_FILES` that are listed or present with `check_against_manifest`."""
+    """Check the files in `INDEX_FILES` that are listed or present, see `check_against_manifest`."""
     listed = read_manifest(root)
     check_against_manifest(root, sorted(name for name in INDEX_FILES if name in listed or (root / name).exists()))
 

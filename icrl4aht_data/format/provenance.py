@@ -153,7 +153,7 @@ class ReferenceEgos(Struct, frozen=True, omit_defaults=True):
 
 
 class NearestTest(Struct, frozen=True, omit_defaults=True):
-    """The test teammate on the same layout with the most similar behaviour to the task's teammate.
+    """The test teammate on the same layout whose behaviour is most similar to that of the task's teammate.
 
     Args:
         teammate: family and number of the test teammate, such as "H3/t1".

@@ -56,7 +56,7 @@ def _delivery_fault(layout: Layout) -> str | None:
         for ingredient, agents in available.items():
             if not any((pot & agents).any() for pot in served):
                 return f"ingredient {ingredient} cannot reach a pot whose soup can be delivered"
-        # Different agents may put the ingredients of a recipe into the pot, but all into the same pot.
+        # The ingredients of a recipe may come from different agents, but must all go into the same pot.
         if not any(all((pot & agents).any() for agents in available.values()) for pot in served):
             return f"the ingredients of recipe {recipe} cannot reach the same pot"
     return None

@@ -20,7 +20,7 @@ FIRST_LINE_SECONDS, LINE_SECONDS = 10.0, 60.0
 def progress_bars(quiet: bool = False, unit: str = "", of_bytes: bool = False) -> Iterator[Callable[..., None]]:
     """Show progress on stderr; yield a function `show(name, done, total, note="")` with one bar for each name.
 
-    Any thread may call `show`. A `total` of None means unknown.
+    Any thread may call `show`. A `total` of None means that the total is unknown.
 
     Args:
         quiet: show nothing.

@@ -74,7 +74,7 @@ def usable_cores() -> int:
 def run_in_slices(work: Callable[[int, int], None], n: int, threads: int, least: int = 1) -> None:
     """Call `work(start, stop)` on slices that cover 0..n, on up to `threads` threads including the caller's.
 
-    If slices raise, one of the errors is raised after all slices have ended.
+    If `work` raises errors, one of them is raised after all slices are finished.
 
     Args:
         work: function that processes the range from `start` to `stop`.

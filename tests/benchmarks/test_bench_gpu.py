@@ -106,7 +106,9 @@ def test_batch_that_does_not_fit_in_memory_is_split(monkeypatch):
     measure = partial(measure_training, size="small", encoder="paper", dtype="float32")
     assert measure(FULL_SIZES) == {"accumulate": 4}
     assert tried == [1, 2, 4]
-    with pytest.raises(MemoryError, match="the batch does not fit in any number of parts: RESOURCE_EXHAUSTED"):
+    with pytest.raises(
+        MemoryError, match="the batch does not fit into memory, however many parts it has: RESOURCE_EXHAUSTED"
+    ):
         measure(SMALL_SIZES)  # a batch of 2 rows has at most 2 parts
 
 

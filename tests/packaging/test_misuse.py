@@ -149,7 +149,7 @@ def test_errors_caused_by_bugs_are_raised():
 def test_unreachable_ray_is_reported():
     with (
         pytest.raises(OptionError, match=r"Ray at 127\.0\.0\.1:1 cannot be reached: .*; check the address"),
-        on_ray._connected(QueueOptions("ray", "127.0.0.1:1")),
+        on_ray._ray_connection(QueueOptions("ray", "127.0.0.1:1")),
     ):
         pass
 

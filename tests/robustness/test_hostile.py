@@ -70,7 +70,7 @@ def policy_card(**changes: Any) -> str:
         (policy_card(widths={"gru": 2**40}), None, "gru = 1099511627776: expected `int` <= 8192"),
         (policy_card(widths={"spatial": [1] * 10**6}), None, "expected `array` of length <= 16"),
         (policy_card(shapes={"params/a": [2**40]}), None, "the card states"),
-        ("[]", None, "policy.json is not an object"),
+        ("[]", None, "policy.json is not a JSON object"),
         (policy_card(), (2**63 - 1).to_bytes(8, "little") + b"{}", "not a checkpoint"),
         (
             policy_card(),

@@ -176,11 +176,11 @@ def best_response_command(
         ResponseJob,
         find_behaviours,
         responses_table,
-        with_headroom,
+        tasks_with_headroom,
         write_responses,
     )
 
-    tasks = with_headroom(shared.chosen_tasks(**choice))
+    tasks = tasks_with_headroom(shared.chosen_tasks(**choice))
     if not tasks:
         raise EmptySelectionError("none of the chosen tasks has headroom; choose other tasks")
     behaviours = find_behaviours(tasks)

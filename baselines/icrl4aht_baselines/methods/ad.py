@@ -114,7 +114,7 @@ class StepModel(nn.Module):
 
 
 def dropped_steps(context: int) -> int:
-    """Return the number of steps that a full window of `context` steps loses at once in cached acting: a fifth.
+    """Return how many steps cached acting drops at once from a full window of `context` steps: a fifth.
 
     A full window then has at least 4/5 of the context, and on average 4 tokens are computed again for each step.
     """
@@ -135,13 +135,13 @@ def step_method(name: str, label: str, model: StepModel, loss: Loss, world: Worl
 
 
 def example_step(world: World) -> StepInput:
-    """Return a `StepInput` of zeros with shape (1, 1), to initialise parameters with."""
+    """Return a `StepInput` of zeros with shape (1, 1), for the initialisation of parameters."""
     zero = jnp.zeros((1, 1), jnp.int32)
     return StepInput(jnp.zeros((1, 1, *world.obs_shape)), zero, jnp.zeros((1, 1)), zero)
 
 
 def auxiliary_losses(output: StepOutput, steps: StepInput, batch: ADBatch, world: World) -> dict[str, Array]:
-    """Return name -> loss of the predicted next observations; empty for a model without +next_obs."""
+    """Return a dict with the loss of the predicted next observations; an empty dict for a model without +next_obs."""
     if output.next_obs is None:
         return {}
     # A prediction has a target only if the next step is in the same window and the same episode.
@@ -151,7 +151,7 @@ def auxiliary_losses(output: StepOutput, steps: StepInput, batch: ADBatch, world
 
 
 def action_method(name: str, label: str, options: ModelOptions, world: World, trunk: nn.Module) -> Method:
-    """Return Algorithm Distillation with the given trunk.
+    """Return the method Algorithm Distillation with the given trunk.
 
     The loss is the cross-entropy of the target actions over valid positions (paper, App. E.2). The target actions are
     the actions of the history, or its labels.

@@ -1,10 +1,10 @@
 """AMAGO-Offline (paper, Sec. 5.4): an offline actor-critic on the sequence encoder.
 
 As in AMAGO (Grigsby et al. 2024), actor and critics share the encoder, and there is one policy and one value for each
-of several discount factors; the ego acts by the last one. Returns continue over episodes, so exploration that helps in
-later episodes is rewarded. The actor imitates the actions with a positive estimated advantage (filtered behaviour
-cloning), and maximises the expected value of its policy (Q term). The critics learn by one-step bootstrapping from a
-slow copy of the parameters. The model does not observe how far the source algorithm's training had progressed.
+of several discount factors; the ego acts with the last policy. Returns continue over episodes, so exploration that
+helps in later episodes is rewarded. The actor imitates the actions with a positive estimated advantage (filtered
+behaviour cloning), and maximises the expected value of its policy (Q term). The critics learn by one-step bootstrapping
+from a slow copy of the parameters. The model does not observe how far the source algorithm's training had progressed.
 
 Shapes: `B` batch size, `L` length of a window, `G` discount factors, `A` actions, `D` width.
 """
@@ -79,7 +79,7 @@ def amago_offline(options: ModelOptions, world: World) -> Method:
         policy_BxLxGxA = jax.nn.softmax(online.logits)
         taken_BxLx1xA = jax.nn.one_hot(actions, world.actions)[:, :, None]
 
-        # Critics' target: r + discount * E[Q_slow(next)] under the policy. The next step's input states the reward.
+        # Critics' target: r + discount * E[Q_slow(next)] under the policy. The next step's input contains the reward r.
         next_value = jnp.sum(jax.lax.stop_gradient(policy_BxLxGxA) * target.values.min(axis=0), axis=-1)[:, 1:]
         reward = REWARD_SCALE * jnp.asarray(batch.prev_rewards)[:, 1:, None]
         bootstrap = jax.lax.stop_gradient(reward + discounts_G * next_value)  # (B, L - 1, G)

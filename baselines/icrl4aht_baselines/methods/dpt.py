@@ -94,16 +94,16 @@ class DPT(nn.Module):
         features, answers = features[:, :length], features[:, length:]
         predicted = None
         if self.next_obs is not None:
-            # A transition's token includes the next observation, so the prediction uses the features of the transition
-            # before it and the encoding of its first observation.
+            # A transition's token includes the next observation. Therefore the next observation is predicted from the
+            # features of the previous transition and the encoding of the transition's first observation.
             known = jnp.concatenate([features[:, :-1], obs_features[:, 1:]], axis=-1)
             predicted = self.next_obs(known, context.action[:, 1:])
         return DPTOutput(self.head(answers), predicted)
 
     def start(self, context: int, cached: bool) -> DPTMemory:
-        """Return the memory of an ego before its first step, for K transitions and a running episode.
+        """Return the memory of an ego before its first step, with slots for K transitions and a running episode.
 
-        `cached` has no effect, because the context is computed again whenever it changes, which is exact.
+        `cached` has no effect, because the context is always computed again when it changes.
         """
         tokens, zero = jnp.zeros((context + KEPT_STEPS, self.tokens.width)), jnp.int32(0)
         return DPTMemory(tokens, zero, zero, self.trunk.start(context + 1), jnp.zeros(self.obs_shape), jnp.bool_(False))
@@ -124,21 +124,21 @@ class DPT(nn.Module):
         context = len(tokens) - KEPT_STEPS
         trunk, variables = self.trunk.unbind()
 
-        def compute(inputs: Any, memory: TransformerMemory) -> Any:
+        def compute_context(inputs: Any, memory: TransformerMemory) -> Any:
             variables, tokens, complete = inputs
             first = jnp.maximum(complete - context, 0)
             window = tokens[(first + jnp.arange(context)) % len(tokens)]
             return trunk.apply(variables, window, context + 1, method="start_after")
 
         changed = done if self.finished_episodes_only else jnp.bool_(True)
-        seen = change_if(changed, compute, (variables, tokens, complete), memory.context)
+        seen = change_if(changed, compute_context, (variables, tokens, complete), memory.context)
         # The query takes the slot after the last transition, where the next query will overwrite it.
         feature, seen = self.trunk.advance(query, seen._replace(written=jnp.minimum(complete, context)))
         return self.head(feature), DPTMemory(tokens, written, complete, seen, obs, jnp.bool_(True))
 
 
 def _repeat_in_turn(values: Shaped[Array, "B Q ..."], length: int) -> Shaped[Array, "B K+1 ..."]:
-    """Return one of Q values for each of the K + 1 prefixes of a context, K = `length`: value j mod Q for prefix j."""
+    """Return a value for each of the K + 1 prefixes of a context, K = `length`: value j mod Q for prefix j."""
     return values[:, jnp.arange(length + 1) % values.shape[1]]
 
 

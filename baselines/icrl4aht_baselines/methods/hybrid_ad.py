@@ -32,7 +32,7 @@ class RecurrentTrunk(nn.Module):
     def __call__(self, x: Float[Array, "B N D"], *, deterministic: bool = True) -> Float[Array, "B N D"]:
         """Return features of complete sequences."""
         zeros = jnp.zeros((x.shape[0], self.layers * self.width), x.dtype)
-        return jnp.swapaxes(self.follow(jnp.swapaxes(x, 0, 1), zeros, deterministic)[0], 0, 1)
+        return jnp.swapaxes(self.run_sequences(jnp.swapaxes(x, 0, 1), zeros, deterministic)[0], 0, 1)
 
     def start(self, context: int) -> Float[Array, " S"]:
         """Return the state before the first token; `context` has no effect."""
@@ -40,16 +40,16 @@ class RecurrentTrunk(nn.Module):
 
     def start_after(self, x: Float[Array, "N D"], context: int) -> Float[Array, " S"]:
         """Return the state after a sequence of tokens."""
-        return self.follow(x[:, None], self.start(context)[None])[1][0]
+        return self.run_sequences(x[:, None], self.start(context)[None])[1][0]
 
     def advance(
         self, x: Float[Array, " D"], state: Float[Array, " S"]
     ) -> tuple[Float[Array, " D"], Float[Array, " S"]]:
         """Return the features of the next token, and the state after this token."""
-        features, state = self.follow(x[None, None], state[None])
+        features, state = self.run_sequences(x[None, None], state[None])
         return features[0, 0], state[0]
 
-    def follow(
+    def run_sequences(
         self, x: Float[Array, "N B D"], state: Float[Array, "B S"], deterministic: bool = True
     ) -> tuple[Float[Array, "N B D"], Float[Array, "B S"]]:
         """Return the features of B sequences, with time on the first axis, and the states after the sequences."""

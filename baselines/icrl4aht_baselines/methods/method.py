@@ -107,7 +107,7 @@ def make_transformer(options: ModelOptions) -> Transformer:
 
 
 def make_tokens(kind: type[TokensType], options: ModelOptions, world: World, **own: Any) -> TokensType:
-    """Return a tokenizer of the class `kind`, with the arguments `own` that only this class has."""
+    """Return a tokenizer of the class `kind`, where `own` holds the arguments that only this class has."""
     dtype = compute_dtype(options)
     return kind(
         encoder=world.encoder(dtype),
@@ -153,7 +153,7 @@ def cross_entropy(logits: Float[Array, "*B A"], action: Int[Array, "*B"], smooth
 
 
 def mean_of_rows(values: Float[Array, "B L"], mask: Bool[Array, "B L"]) -> Float[Array, ""]:
-    """Return the mean over rows of the mean over the row's valid positions (1/|M| in the paper).
+    """Return the mean of a loss over valid positions in each row (1/|M| in the paper), then over rows.
 
     All rows have the same weight, so the loss of a batch is the mean of the losses of its parts.
     """

@@ -1,4 +1,4 @@
-"""Hyper-parameters of the models; imports no JAX, so that help texts are printed quickly."""
+"""Hyper-parameters of the models. This module does not import JAX, so that help texts are printed quickly."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Positions = Literal["none", "rope"]
 
 
 class ModelSize(NamedTuple):
-    """Values of options for a named model size; options that it does not state have their defaults.
+    """Values of some options for a named model size; all other options have their defaults.
 
     Attributes:
         model: values of `ModelOptions`.

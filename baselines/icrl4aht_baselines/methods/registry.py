@@ -1,4 +1,4 @@
-"""Methods by name, and the description of OvercookedV2 that models are made for."""
+"""Registry of methods by name, and the `World` that describes OvercookedV2 to models."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def overcooked_world(
     canonical: bool = False,
     partners: int = 0,
 ) -> World:
-    """Return OvercookedV2 on some layouts, all with observations of one shape, as a `World`.
+    """Return the `World` that describes OvercookedV2 on layouts whose observations have the same shape.
 
     Args:
         layouts: layouts of the batches.

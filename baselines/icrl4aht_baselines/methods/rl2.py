@@ -55,8 +55,8 @@ class RL2Model(nn.Module):
     head: PolicyValueHead
 
     def __call__(self, steps: StepInput, state: Float[Array, "B S"]) -> tuple[PolicyValue, Float[Array, "B S"]]:
-        """Return the output for T steps of B tasks, inputs (T, B, ..), and the state after the last step."""
-        features, state = self.trunk.follow(self.tokens(steps), state)
+        """Return the output for T steps of B tasks, inputs with axes (T, B, ..), and the state after the last step."""
+        features, state = self.trunk.run_sequences(self.tokens(steps), state)
         return self.head(features), state
 
     def start(self, context: int, cached: bool) -> Float[Array, " S"]:

@@ -136,7 +136,7 @@ class NumberedBatches:
         numbers = self._numbers[np.zeros(rows, np.int32) if batch.layouts is None else batch.layouts]
         if not self._layouts:
             return batch._replace(layouts=numbers)
-        # Like the batch, its mirroring is a function of the batch number and the process.
+        # The mirroring depends only on the seed, the batch number and the process, as the batch does.
         drawn = np.random.default_rng((self._sampler.seed, i, self._sampler.process_index))
         mirroring = drawn.integers(4, size=rows, dtype=np.int32)
         actions = {
@@ -144,7 +144,7 @@ class NumberedBatches:
             for name, values in batch._asdict().items()
             if values is not None and (name.endswith("actions") or name == "query_target")
         }
-        if hasattr(batch, "is_first"):  # fillers before a task's first step stay 0, as in acting
+        if hasattr(batch, "is_first"):  # values before a task's first step stay 0, as in acting
             filler = batch.is_first | ~batch.attention_mask
             actions |= {name: np.where(filler, 0, actions[name]) for name in actions if name.startswith("prev_")}
         return batch._replace(**actions, layouts=numbers + self._layouts * mirroring)

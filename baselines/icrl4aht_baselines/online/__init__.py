@@ -1,1 +1,1 @@
-"""Learning and recording by playing: RL^2, and histories of trained agents."""
+"""Training by playing (RL^2, best responses), and recording of histories of trained agents."""

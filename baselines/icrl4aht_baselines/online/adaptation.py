@@ -106,7 +106,7 @@ def headroom_jobs(
 
 
 def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | None:
-    """Return the entry of a set of tasks for cards/adaptation.json; None if no seed has finished jobs of both egos.
+    """Return the entry of a set of tasks for cards/adaptation.json; None if no seed has finished both kinds of ego.
 
     An entry has the training steps, the width of the network, the mean return of each kind of ego for each seed,
     and the mean return on each layout over these seeds.
@@ -137,7 +137,7 @@ ADAPTATION = "adaptation.json"
 
 
 def write_adaptation(jobs: Sequence[HeadroomJob], folder: Path) -> Path:
-    """Add the measurements of finished jobs to a folder's file `ADAPTATION`. Return its path.
+    """Add the measurements of finished jobs to a folder's file `ADAPTATION`. Return the file's path.
 
     The entry of a set of tasks is replaced, unless the stored entry has more seeds.
     """
@@ -159,7 +159,7 @@ def read_adaptation(folder: Path) -> list[dict[str, Any]]:
 
 
 def adaptation_table(folder: Path, layouts: bool = True) -> str:
-    """Return a Markdown table of measured sets of tasks: returns of both egos, and their difference.
+    """Return a Markdown table of measured sets of tasks: the return of each kind of ego, and the difference.
 
     The difference has a 95 % Student's t interval over the training seeds if there are several. A set of several
     layouts also gets a row for each layout, unless `layouts` is False.

@@ -1,4 +1,4 @@
-"""Recording of histories of source `agent`: a trained agent plays with a release's teammates and is labelled.
+"""Recording of histories of source `agent`: a trained agent plays with a release's teammates, and steps get labels.
 
 The agent's memory lasts for a history, as it lasts for a task in an evaluation. The probability of a random action may
 fall over a history's episodes, as in noise distillation (Zisman et al. 2024). `expert_actions` are the agent's choices
@@ -95,7 +95,8 @@ def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> P
     """
     if labeller is not None and labeller.sees != policy.sees:
         raise OptionError(
-            f"the labeller takes {labeller.sees}, expected {policy.sees}, which the agent takes; choose a trained model"
+            f"the labeller's input is {labeller.sees}, expected {policy.sees} as for the agent; choose a labeller with "
+            f"the same input"
         )
     params = policy.params, None if labeller is None else labeller.params
 
@@ -145,11 +146,11 @@ def record_histories(
     make_labeller: Callable[[Layout], Policy] | None = None,
     swaps: Mapping[str, TeammateSwaps] = MappingProxyType({}),
 ) -> RecordedHistories:
-    """Play `config.histories` histories of each task, in the order of tasks that share layout and teammate family.
+    """Play `config.histories` histories of each task, in the order of the tasks.
 
     Args:
         make_ego: function from a layout to the agent, as for `evaluate`.
-        tasks: the tasks; their seeds determine the noise schedules and the episodes.
+        tasks: tasks with one layout and teammate family; their seeds determine the noise schedules and the episodes.
         config: number, length and noise of the histories.
         suite: folder of learned teammates, if tasks have any.
         played: function for progress, called with the number of episodes played since the last call.
@@ -163,16 +164,16 @@ def record_histories(
     seeds = range(config.histories)
 
     @cache  # all segments share one compiled program only if the agent is the same object
-    def noisy(layout: Layout) -> Policy:
+    def noisy_agent(layout: Layout) -> Policy:
         return with_noise(make_ego(layout), KEPT_STEPS, None if make_labeller is None else make_labeller(layout))
 
     every = next((one.every for one in swaps.values()), None)
     protocol = replace(get_protocol("seeded", config.episodes), swap_every=every)
     programs, prepared, parts = Programs(), None, list[tuple[np.ndarray, ...]]()
-    for length in segment_lengths(protocol):  # a segment has no change of teammates
+    for length in segment_lengths(protocol):  # within a segment, teammates do not change
         mates = [swaps[one.task_id].teammate(len(parts)) if one.task_id in swaps else one.teammate for one in tasks]
         playing = [replace(task, teammate=mate) for task, mate in zip(tasks, mates, strict=True)]
-        prepared = prepare_rollout(noisy, playing, protocol, seeds, suite, programs=programs, earlier=prepared)
+        prepared = prepare_rollout(noisy_agent, playing, protocol, seeds, suite, programs=programs, earlier=prepared)
         for _ in range(length):
             rollout, state, episode = prepared
             state = state._replace(ego=state.ego._replace(chance=jnp.asarray(chances[:, len(parts)])))
@@ -187,9 +188,9 @@ def record_histories(
 
 
 def plan_swaps(tasks: Sequence[Task], episodes: int, every: int) -> dict[str, TeammateSwaps]:
-    """Return task id -> the sequence of teammates that play in the task's histories.
+    """Return the sequence of teammates in each task's histories, by task id.
 
-    The sequence begins with the task's teammate. The teammates of all other tasks with the same layout, track, split
+    A sequence begins with the task's teammate. The teammates of all other tasks with the same layout, track, split
     and kind of teammate follow, in the cyclic order of `tasks`. No validation teammate plays in a training history,
     because splits are not mixed. Tasks without another teammate to swap with are left out.
 

@@ -1,4 +1,4 @@
-"""Best responses: egos with the benchmark's view, each trained with a single teammate.
+"""Best responses: egos with the benchmark's 5 x 5 view, each trained with a single teammate.
 
 The mean return B of a best response estimates what an ego could earn with a teammate that it knows from the start. B is
 a lower bound, because longer training or another learner may earn more. For comparison, jax-aht trains PPO egos for
@@ -93,7 +93,7 @@ def find_behaviours(tasks: Iterable[Task]) -> list[tuple[Task, ...]]:
     return found
 
 
-def with_headroom(tasks: Iterable[Task]) -> list[Task]:
+def tasks_with_headroom(tasks: Iterable[Task]) -> list[Task]:
     """Return the tasks in which the scripted oracle earns more than `stay`, according to stored measurements.
 
     Tasks without a measurement, such as those of the track preference, are included.
@@ -132,14 +132,14 @@ class EgoJob(TrainingJob):
 
     @property
     def model(self) -> ModelOptions:
-        """Architecture of the ego: that of the bundled rl2 models, with the width that the options state."""
+        """Architecture of the ego: the bundled rl2 models' architecture, with the width from the options."""
         return ModelOptions(**{**RL2_SETTINGS["model"], "width": self.options.width})
 
     @property
     def settings(self) -> dict[str, Any]:
         """All settings that the result depends on, as JSON."""
         options = asdict(self.options)
-        del options["width"]  # already in `model`
+        del options["width"]  # the width is part of `model`
         return {
             "seed": self.seed,
             "options": options,
@@ -200,9 +200,9 @@ class ResponseJob(EgoJob):
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
         """Train the ego, and measure its returns in episodes with other seeds than in training.
 
-        "choice" is the mean return over the tasks with `CHOICE_SEEDS`, "return" that with `REPORT_SEEDS`; both are
-        measured with the most probable actions ("greedy") and with sampled actions ("sampled"). "slope" is the training
-        return in the last quarter of the steps minus that in the third quarter.
+        "choice" is the mean return over the tasks in episodes with `CHOICE_SEEDS`, "return" in episodes with
+        `REPORT_SEEDS`. Each is measured with the most probable actions ("greedy") and with sampled actions ("sampled").
+        "slope" is the training return in the last quarter of the steps minus that in the third quarter.
         """
         task, params = self.tasks[0], None
         if self.options.init:
@@ -268,7 +268,7 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainedRespo
 
 
 def include_models(found: BestResponse, models: Mapping[str, Mapping[str, float]]) -> BestResponse:
-    """Return a best response with the return of the best model, if that model earns more.
+    """Return a best response in which the best of some models replaces the trained ego, if the model earns more.
 
     Args:
         found: best response that was trained.

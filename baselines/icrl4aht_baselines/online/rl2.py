@@ -264,7 +264,7 @@ class _Player:
         look = partial(observe, agent=EGO, canonical=True)
         seen_records = jnp.concatenate([played.record, after.env.record[:, None]], axis=1)
         steps = StepInput(
-            obs=jnp.swapaxes(env.on_tables(look, state.env.layout, seen_records), 0, 1),
+            obs=jnp.swapaxes(env.call_with_tables(look, state.env.layout, seen_records), 0, 1),
             prev_action=jnp.concatenate([state.before.prev_action[None], taken]),
             prev_reward=jnp.concatenate([state.before.prev_reward[None], reward]),
             prev_teammate_action=jnp.concatenate([state.before.prev_teammate_action[None], theirs]),

@@ -38,10 +38,10 @@ MIXTURE: tuple[tuple[float, tuple[float, ...]], ...] = (
 
 
 def tasks_on_layouts(tasks: Sequence[Task], layouts: Sequence[Layout]) -> list[Task]:
-    """Return those tasks of a manifest that are on one of the layouts.
+    """Return the tasks of a manifest that are on one of the layouts.
 
     Raises:
-        OptionError: if a task has a learned teammate (the message names the task), or none of the tasks is on a layout.
+        OptionError: if a task has a learned teammate (the message names the task), or no task is on one of the layouts.
     """
     for task in tasks:
         if task.teammate["kind"] != "heuristic":
@@ -61,7 +61,7 @@ def tasks_on_layouts(tasks: Sequence[Task], layouts: Sequence[Layout]) -> list[T
 
 
 def mixed_chances(tasks: int) -> np.ndarray:
-    """Return the probabilities of the teammates' behaviours in some tasks, float32 (tasks, 4), as `MIXTURE` states."""
+    """Return the probabilities of the teammates' behaviours according to `MIXTURE`, float32 (tasks, 4)."""
     shares = np.cumsum([share for share, _ in MIXTURE])
     kind = np.searchsorted(shares, (np.arange(tasks) + 0.5) / tasks * shares[-1])
     return np.array([chances for _, chances in MIXTURE], np.float32)[kind]
@@ -88,7 +88,7 @@ def with_behaviours(teammates: Sequence[Policy], chances: np.ndarray) -> list[Po
 
 @lru_cache(maxsize=64)
 def _behaviour_functions(script_init: Callable[..., Any], script_act: Callable[..., Any]) -> tuple[Any, Any]:
-    """Return the functions `init` and `act` of teammates with behaviours, for given functions of the script."""
+    """Return the functions `init` and `act` of teammates with behaviours, made from the script's functions."""
     noise = jnp.array([0.0, 0.0, 1.0, NOISY_SHARE])  # probability of a random action in each behaviour
 
     def init(params: Any, key: jax.Array) -> tuple[jax.Array, Any]:

@@ -129,22 +129,22 @@ def _batch_view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchV
 def _load_histories(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
     """Open the release that the training histories are chosen from, with state records if all histories have them.
 
-    By default, channels are canonical if all layouts are chosen, or layouts with different own channels.
+    By default, channels are canonical if all layouts are chosen, or if the layouts' own channels differ.
 
     Returns:
         The chosen training histories, and the validation histories that pass the same filters, or None.
     """
     every = ALL_LAYOUTS in histories.layouts
-    release = load_icrl4aht(histories.root, obs="uint8")  # opened first, since it may define layouts
+    release = load_icrl4aht(histories.root, obs="uint8")  # the release may define layouts, so it is opened first
     names = None if every else [get_layout(name).name for name in histories.layouts]
     found = filter_histories(release.filter(split="train", layout=names), histories.filters)
     differ = len({layout.obs_shape for layout in found.layouts}) > 1
     channels = histories.channels or ("canonical" if every or differ else "own")
     if channels == "own" and differ:
         raise OptionError(
-            f"channels = own: the layouts {', '.join(layout.name for layout in found.layouts)} have own channels of "
-            f"unequal number: leave out --channels or take canonical, or train on one of them, such as --layout "
-            f"{found.layouts[0].name}"
+            f"channels = own: the layouts {', '.join(layout.name for layout in found.layouts)} have different "
+            f"numbers of own channels: leave out --channels or choose canonical, or train on one layout, such as "
+            f"--layout {found.layouts[0].name}"
         )
     options: Any = {"obs": "state" if found.has_states else None, "channels": channels}
     validation = None
@@ -229,12 +229,13 @@ def _sampler(
     if method.data == "dpt":
         if every > 1:
             raise OptionError(
-                f"every = {every}: {method.name} learns from contexts of one part of a history; leave it out"
+                f"every = {every}: {method.name} learns from contexts, but only windows can skip episodes; leave out "
+                "--every"
             )
         return dataset.dpt(context=options.context, order=histories.order, queries=histories.queries, **shared)
     if histories.queries > 1:
         raise OptionError(
-            f"queries = {histories.queries}: {method.name} learns from windows without queries; leave it out"
+            f"queries = {histories.queries}: {method.name} learns from windows without queries; leave out --queries"
         )
     if options.context > steps:
         raise OptionError(
@@ -262,7 +263,7 @@ class HistorySplit(NamedTuple):
 def hold_out(dataset: Dataset, share: float = 0.1, validation: Dataset | None = None) -> HistorySplit:
     """Hold out a share of the teammates, and a share of the histories with the other teammates.
 
-    At least one teammate and one history are held out, but no histories if each task has only one. Every task with a
+    At least one teammate and one history are held out, but no history if each task has only one. Every task with a
     teammate that is not held out keeps at least one training history. The choice depends on names only, see
     `splitting`; `Dataset.split` makes the same choice.
 
@@ -319,12 +320,12 @@ class TrainedModel(NamedTuple):
 
 
 def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
-    """Return the parameters of a run, to start a new run from, and add the given run to the new run's settings.
+    """Return the parameters of a run as the start of a new run, and add the old run to the new run's settings.
 
     Args:
-        run: run folder to take the parameters from.
+        run: run folder of the old run.
         method: method of the new run.
-        about: settings of the new run, to which the run and its record of training data are added.
+        about: settings of the new run, to which the old run and its record of training data are added.
 
     Raises:
         OptionError: if the parameters are of another model; the message states the options that differ.
@@ -373,7 +374,7 @@ def read_trained(folder: Path) -> TrainedModel:
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
-    label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # `words` and `paper` compute equal features
+    label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # encoders `words` and `paper` have equal features
     names, digest = tuple(layout.name for layout in layouts), json_hash(config)
     hidden = tuple(histories.get("hide_recipe", ()))
     return TrainedModel(

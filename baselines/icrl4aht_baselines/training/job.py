@@ -79,12 +79,12 @@ class TrainingJob(ABC):
         return parse_json(read_text(self.result_file))
 
     def progress(self) -> tuple[int, float] | None:
-        """Return the finished training steps, and environment or history steps per second; None without a log line."""
+        """Return the finished training steps, and environment or history steps/s; None if no line is logged."""
         timing = last_line(self.run_folder / TIMING)
         return None if timing is None else (timing["step"], timing["steps_per_second"] * self.options.steps_per_update)
 
     def step_progress(self, on_update: OnUpdate) -> StepProgress:
-        """Return the trainer's function for progress that calls `on_update`."""
+        """Return a function for the trainer to report progress with, which calls `on_update`."""
         return lambda step, loss: on_update(step, (self.progress() or (0, 0.0))[1])
 
     def finished_text(self) -> str:

@@ -28,7 +28,7 @@ LogLine = Callable[[Mapping[str, Any]], None]
 
 @contextmanager
 def _tensorboard(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
-    """Log to TensorBoard event files, with a folder for each part, so that charts show all parts together."""
+    """Log to TensorBoard event files; each part of the data has its folder, so charts show all parts together."""
     from tensorboardX import SummaryWriter
 
     writers: dict[str, Any] = {}
@@ -75,7 +75,7 @@ def _trackio(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
 
     wanted = os.environ.get("TRACKIO_DIR") or str(folder.absolute())
     with _temporary_entry(os.environ, "TRACKIO_DIR", wanted):
-        import trackio  # only the first import reads the variable
+        import trackio  # reads TRACKIO_DIR only at the first import
         from trackio.utils import TRACKIO_DIR as used
     if used != Path(wanted):
         raise OptionError(
@@ -113,7 +113,7 @@ def check_loggers(names: Iterable[str]) -> None:
     for name in names:
         check_choice("logger", name, LOGGER_NAMES)
         if name in _LOGGERS and find_spec(module := _LOGGERS[name][0]) is None:
-            raise OptionError(f"the log for {name} needs {module}: {install_command(name)}")
+            raise OptionError(f"the logger {name} needs {module}: {install_command(name)}")
 
 
 @contextmanager
@@ -154,7 +154,7 @@ def _prefixed(line: Mapping[str, Any]) -> dict[str, float]:
 
 @contextmanager
 def _temporary_entry(mapping: MutableMapping[str, Any], name: str, value: Any) -> Iterator[None]:
-    """Context manager that temporarily gives an entry of a mapping another value."""
+    """Context manager that temporarily changes an entry of a mapping."""
     before = mapping.get(name)
     mapping[name] = value
     try:

@@ -256,7 +256,7 @@ class TrainingTask(NamedTuple):
             if writes:
                 stack.enter_context(run_lock(folder))
             config = open_run(folder, config)
-            # Equal bits need equal numbers of threads, because the order of sums depends on them.
+            # Bitwise equal results after a resume need the same number of threads, which determines the order of sums.
             checkpoints = Checkpoints(folder / CHECKPOINTS, config | {"xla_threads": xla_threads()})
             if checkpoints.latest is None:
                 state = trainer.init()
@@ -271,7 +271,7 @@ class TrainingTask(NamedTuple):
             log = stack.enter_context(closing(RunLog(folder, lambda line: line["step"] <= first)))
             loggers = stack.enter_context(open_loggers(log_to if writes else (), folder / METRICS, config))
             batches = stack.enter_context(trainer.batches(self.data.train, first, options.steps))
-            stop = stack.enter_context(stop_signals())  # entered last, so that a signal ends the setup as usual
+            stop = stack.enter_context(stop_signals())  # last, so that a signal during setup ends the process
             before = first, time.perf_counter(), 0.0
             save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * SAVE_MINUTES)
             loss: float | None = None

@@ -19,10 +19,10 @@ RENDER_MODES = ["rgb_array"]
 
 
 def check_choices(channels: str, render_mode: str | None = None) -> None:
-    """Validate the channels and the render mode of an environment.
+    """Validate the names of an environment's observation channels and render mode.
 
     Raises:
-        UnknownNameError: if the channels or the render mode do not exist.
+        UnknownNameError: if one of the names does not exist.
     """
     for name, value, valid in (("channels", channels, CHANNELS), ("render_mode", render_mode, (None, *RENDER_MODES))):
         if value not in valid:
@@ -70,7 +70,7 @@ def check_integers(
         shape: the valid shape; by default any shape with one axis.
 
     Raises:
-        OptionError: if the value is no such array.
+        OptionError: if the value is not an array of this shape with integers in this range.
     """
     found = np.asarray(value)
     numeric = found.dtype.kind in "iu" and found.size > 0

@@ -42,7 +42,7 @@ def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[
     entry = dataset.index.entry(history_id)
     task, number = dataset.history_task(history_id), episode
     ego = dataset.provenance.get(task.task_id, Provenance()).ego
-    if entry.source in SCRIPTED_SOURCES:  # a script plays every episode in a new environment
+    if entry.source in SCRIPTED_SOURCES:  # every scripted episode is the first of a new environment
         key, number = scripted_episode_keys(task.seed, np.array([entry.env_idx]), np.array([episode]))[0], 0
     elif entry.source == "ppo" and ego is not None:
         key = stream_keys(learner_key(Work(task, learner=entry.learner)), ego["environments"])[entry.env_idx]
@@ -56,6 +56,7 @@ def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[
     if not np.array_equal(drawn, recorded):
         raise NotStoredError(
             f"{dataset.root}: history {history_id}: the keys of seed {entry.seed} do not give the recorded start of "
-            f"episode {episode}: other code generated the history; use dataset.reset_options, which needs no keys"
+            f"episode {episode}, because another version of the code generated the history; use "
+            f"dataset.reset_options, which needs no keys"
         )
     return {"key": np.asarray(jax.random.key_data(key)), "episode": number}

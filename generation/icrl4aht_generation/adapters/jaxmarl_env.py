@@ -52,7 +52,7 @@ class JaxMARLState:
 
 
 class JaxMARLEnv(MultiAgentEnv):
-    """Both agents of a layout, as a `MultiAgentEnv` for JaxMARL's learners and wrappers.
+    """Environment of a layout for JaxMARL's learners and wrappers, which choose the actions of both agents.
 
     Agents: "agent_0", the ego, and "agent_1", the teammate.
     Observation: uint8 (5, 5, C) of each agent, as `icrl4aht_data.overcooked.observe.observe_both` describes.
@@ -146,7 +146,7 @@ class JaxMARLEnv(MultiAgentEnv):
         return dict.fromkeys(self.agents, jnp.ones(len(ACTIONS), bool))
 
     def observation_space(self, agent: str = "") -> spaces.Box:
-        """Return the observation space, equal for both agents; JaxMARL's learners call it without an agent."""
+        """Return the observation space, equal for both agents; JaxMARL's learners omit the argument `agent`."""
         return self.observation_spaces[self.agents[0]]
 
     def action_space(self, agent: str = "") -> spaces.Discrete:

@@ -1,4 +1,4 @@
-"""Both agents of a layout as a PettingZoo parallel environment."""
+"""The environment of a layout with PettingZoo's parallel interface, for policies of both agents."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ AGENT_NAMES = ("ego", "teammate")
 
 
 class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
-    """Both agents of a layout, for self-play and cross-play.
+    """Environment of a layout with actions for both agents, for self-play and cross-play.
 
     Agents: "ego" and "teammate", with equal spaces. If walls divide the layout, each agent starts on its own side.
     Observation: uint8 (5, 5, C) of each agent, as `icrl4aht_data.overcooked.observe.observe_both` describes.
@@ -115,7 +115,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         record = None if given is None else check_record(self.layout, given)
         self._running, observations = self._start(key, record)
         self.agents = list(AGENT_NAMES)
-        return self._by_agent(observations), {agent: {} for agent in AGENT_NAMES}
+        return self._observations_by_agent(observations), {agent: {} for agent in AGENT_NAMES}
 
     def step(
         self, actions: Mapping[str, SupportsIndex]
@@ -139,7 +139,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
             self.agents = []
         infos = {agent: {"shaped_reward": float(one)} for agent, one in zip(AGENT_NAMES, shaped[0], strict=True)}
         return (
-            self._by_agent(observations),
+            self._observations_by_agent(observations),
             dict.fromkeys(AGENT_NAMES, float(reward[0])),
             dict.fromkeys(AGENT_NAMES, False),
             dict.fromkeys(AGENT_NAMES, ended),
@@ -161,7 +161,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         return np.array(self._running.record[0])
 
     @staticmethod
-    def _by_agent(observations: Any) -> dict[str, np.ndarray]:
+    def _observations_by_agent(observations: Any) -> dict[str, np.ndarray]:
         return dict(zip(AGENT_NAMES, np.asarray(observations)[0], strict=True))
 
 

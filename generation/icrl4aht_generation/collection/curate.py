@@ -84,7 +84,7 @@ def relabel(layout: Layout, network: ActorCritic, params: Any, states: np.ndarra
     Args:
         layout: layout of the stream.
         network: the ego's network.
-        params: parameters of the checkpoint that labels.
+        params: parameters of the checkpoint that chooses the actions.
         states: state records of the stream, uint8 (T, S).
     """
     return _by_step(_compiled_greedy(layout, network.widths)(params, _by_episode(states)))

@@ -8,13 +8,13 @@ from pathlib import Path
 from icrl4aht_data.overcooked.layouts import Layout, add_layouts
 from icrl4aht_generation.collection.scripted import play_histories
 from icrl4aht_generation.collection.scripted_rollout import scripted_batches
-from icrl4aht_generation.collection.task import TASK_SAVE_SECONDS, learn_histories
+from icrl4aht_generation.collection.task import TASK_SAVE_SECONDS, train_and_record
 from icrl4aht_generation.collection.task_folder import is_task_finished, last_timing, partial_folder, publish_artefact
 from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.resume import run_lock
 from icrl4aht_generation.profiles import Profile, Work
 
-_GENERATORS = {"ppo": learn_histories, "noise": play_histories, "search": play_histories}
+_GENERATORS = {"ppo": train_and_record, "noise": play_histories, "search": play_histories}
 """Function of each source that generates an artefact in its partial folder, or resumes there."""
 
 
@@ -76,7 +76,7 @@ class CollectionJob:
         return is_task_finished(self.folder, self.work, self.profile)
 
     def progress(self) -> tuple[int, float] | None:
-        """Return finished updates and steps per second from the timing file; None before the first update."""
+        """Return the number of finished updates and the steps per second; None before the first update."""
         timing = last_timing(self.folder)
         return (int(timing["update"]) + 1, timing["steps_per_second"]) if timing else None
 
@@ -108,6 +108,6 @@ class CollectionJob:
             publish_artefact(partial, self.folder)
 
     def finished_text(self) -> str:
-        """Return a message on the finished artefact, with the speed if known."""
+        """Return a message that the artefact is finished, with the speed if known."""
         progress = self.progress()
         return f"finished at {progress[1]:,.0f} steps/s" if progress else "finished"

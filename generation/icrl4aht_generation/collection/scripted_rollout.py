@@ -55,7 +55,7 @@ def noise_schedules(config: NoiseConfig, seed: int) -> np.ndarray:
     share = np.linspace(0, 1, config.episodes)
     length = finish - begin
     fallen = np.where(length > 0, (share - begin) / np.where(length > 0, length, 1), share >= finish).clip(0, 1)
-    # Rounding hides that the last bits of a power differ between platforms.
+    # Rounding removes the last bits of a power, which differ between platforms.
     return np.round(end + (start - end) * (1 - fallen) ** power, 6).astype(np.float32)
 
 
@@ -81,7 +81,7 @@ def scripted_batches(source: str, config: NoiseConfig) -> list[ScriptedBatch]:
         histories = np.arange(config.histories)
         return [(histories, np.full_like(histories, episode)) for episode in range(config.episodes)]
     count, each = config.histories * config.episodes, np.arange(EPISODES_AT_ONCE)
-    # The last batch is filled up with copies of the last episode: equal sizes share one compilation.
+    # Copies of the last episode fill up the last batch, because batches of equal size share one compilation.
     numbers = [np.minimum(first + each, count - 1) for first in range(0, count, EPISODES_AT_ONCE)]
     return [np.divmod(batch, config.episodes) for batch in numbers]
 
@@ -173,7 +173,7 @@ def _compiled_play(teammate: Policy, searches: bool) -> Callable[..., tuple[dict
             "actions": by_episode(choice.action),
             "teammate_actions": by_episode(rollout.actions[..., TEAMMATE]),
             "rewards": by_episode(rollout.reward),
-            "episode_end_state": carry.env.record,  # not reset yet, as the environment's episodes are longer
+            "episode_end_state": carry.env.record,  # not a reset state, because the environment's episodes are longer
             "script_actions": by_episode(choice.clean),
         }
         return episodes, carry.memories[EGO] if searches else None

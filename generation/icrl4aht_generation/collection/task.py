@@ -44,7 +44,7 @@ def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Lea
     return Learner(Environment(task.layout), teammate, profile.ego_on(task.layout.name))
 
 
-def learn_histories(
+def train_and_record(
     work: Work, profile: Profile, partial: Path, on_update: OnUpdate, suite: Path | None, save_seconds: float
 ) -> None:
     """Train the ego of a task, and record its histories in a partial artefact."""
@@ -74,7 +74,7 @@ def learn_histories(
 
 
 def saved_progress(saved: StateFile) -> int:
-    """Return the number of updates saved under the same settings; without a save, empty the folder and return 0."""
+    """Return the number of updates saved with the same settings; if nothing is saved, empty the folder and return 0."""
     with suppress(OtherSettingsError):  # another profile or version saved this state, so it cannot be resumed
         if done := saved.progress:
             return done
@@ -84,6 +84,6 @@ def saved_progress(saved: StateFile) -> int:
 
 
 def learner_key(work: Work) -> Any:
-    """Return the typed JAX key of a learner; the learners of a task have independent keys from the task's seed."""
+    """Return the typed JAX key of a learner; learners of a task have independent keys, derived from its seed."""
     key = jax.random.key(work.task.seed)
     return jax.random.fold_in(key, work.learner) if work.learner else key

@@ -92,7 +92,7 @@ def arrays_bytes(shapes: Mapping[str, tuple[tuple[int, ...], str]]) -> int:
 
 
 def record_rollout(histories: Mapping[str, np.ndarray], update: int, rollout: Rollout) -> None:
-    """Write those steps of a rollout that the histories store into `HISTORY_ARRAYS`.
+    """Copy the first 100 steps of each episode in a rollout, and the state after them, into the histories' arrays.
 
     All environments start episodes in the same steps, so a step's number determines its episode and its step in the
     episode. Writing a rollout twice changes nothing, so a resumed task may write it again.
@@ -129,7 +129,7 @@ def checkpoint_path(folder: Path, number: int) -> Path:
 
 
 def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
-    """Return all settings that an artefact depends on, as JSON values; if any changes, the artefact is outdated."""
+    """Return all settings that an artefact depends on, as JSON values; any change makes the artefact outdated."""
     settings: dict[str, Any] = {
         "task": asdict(work.task),
         "source": work.source,
@@ -156,7 +156,7 @@ def hashed_files(work: Work, profile: Profile) -> list[str]:
 
 
 def is_task_finished(folder: Path, work: Work, profile: Profile) -> bool:
-    """Return whether a folder contains the complete artefact of these settings with unchanged files."""
+    """Return whether a folder contains the complete artefact of a unit of work, with the profile's settings."""
     settings = artefact_settings(work, profile)
     try:
         metadata = parse_json(read_text(folder / METADATA))
@@ -168,7 +168,7 @@ def is_task_finished(folder: Path, work: Work, profile: Profile) -> bool:
 
 
 def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:
-    """Return the disk space in bytes of an unfinished artefact, including two copies of the learner's state.
+    """Return the bytes of disk space that an unfinished artefact needs, with two copies of the learner's state.
 
     Args:
         task: task of the artefact.
@@ -182,7 +182,7 @@ def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:
 
 @contextmanager
 def reserve_disk(partial: Path, needed: int) -> Iterator[None]:
-    """Check that the disk has space for an artefact, and raise errors of a full disk as `DiskFullError`.
+    """Check that the disk has space for an artefact, and convert errors of a full disk to `DiskFullError`.
 
     If the disk is full, an artefact without a saved state to resume from is removed.
 
@@ -270,7 +270,7 @@ class ArrayWriter:
         self._recording += time.perf_counter() - began
 
     def timing(self, steps: int) -> dict[str, float]:
-        """Return the steps per second, the total seconds and the seconds of recording, after `steps` more steps.
+        """Add `steps` to the counted steps, and return steps per second, total seconds and seconds of recording.
 
         Measurement starts after the first batch, because that batch includes compilation.
         """
@@ -333,7 +333,7 @@ class ArtefactWriter(ArrayWriter):
     def write_checkpoint(self, updates: int, network: ActorCritic, params: Any) -> None:
         """Write and sync a checkpoint of the ego if this number of updates is among `checkpoint_updates`.
 
-        Call this before saving the learner's state, so that a resumed task has all checkpoints.
+        Call this function before saving the learner's state, so that a resumed task has all checkpoints.
         """
         moments = checkpoint_updates(self._config)
         if updates in moments:

@@ -37,7 +37,7 @@ class LayoutFacts(NamedTuple):
         piles: bool (3, cells), piles of each ingredient that the ego can face.
         passed: bool (P,), pots that are farther from the teammate's piles than another pot of the ego.
         obstacle: uint8 (cells,), index in `ways` for each cell of the teammate; 0 (no obstacle) in separate rooms.
-        ways: uint8 (O, cells, cells), steps from each cell until the ego faces each other cell, around an obstacle.
+        ways: uint8 (O, cells, cells), steps from each cell until the ego faces each target cell, around an obstacle.
         leg: uint8 (cells, P), steps from facing a cell to facing a pot, without a teammate in the way.
         trip: int32 (P, 3), steps to carry a piece of each ingredient from its pile to a pot and to return.
         hindrance: int16 (3, cells, cells), how much an ego that waits hinders the teammate; see `_hindrance`.
@@ -62,10 +62,12 @@ class LayoutFacts(NamedTuple):
 
 def stack_facts(layouts: Sequence[Layout]) -> LayoutFacts:
     """Return the `LayoutFacts` of several layouts, padded to the largest and stacked on a new first axis."""
-    return stack_padded([study_layout(layout) for layout in layouts], {"ways": NOWHERE, "leg": NOWHERE, "trip": FAR})
+    return stack_padded(
+        [compute_layout_facts(layout) for layout in layouts], {"ways": NOWHERE, "leg": NOWHERE, "trip": FAR}
+    )
 
 
-def study_layout(layout: Layout) -> LayoutFacts:
+def compute_layout_facts(layout: Layout) -> LayoutFacts:
     """Compute the `LayoutFacts` of one layout."""
     kinds, tables = layout.kinds, layout.tables
     # An agent reaches the cells that it can face, so both agents reach a counter between their rooms.
@@ -85,12 +87,12 @@ def study_layout(layout: Layout) -> LayoutFacts:
             their_steps += _steps_or_far(tables.target_distance[start, cells], NEVER)
     passed = their_steps > their_steps[pots].min(initial=NEVER)
 
-    # In separate rooms the teammate never blocks the ego, so one table of ways without an obstacle is enough.
+    # In separate rooms the teammate never blocks the ego, so one table of walks without an obstacle is enough.
     shares_room = np.array_equal(*layout.rooms)
     obstacles = np.array([-1, *(layout.rooms[EGO] if shares_room else [])], int)
     number = np.zeros(layout.cells, np.uint8)
     number[obstacles[1:]] = range(1, len(obstacles))
-    ways = _shortest_ways(layout, obstacles)
+    ways = _shortest_walks(layout, obstacles)
     leg = np.full((layout.cells, layout.cells), FAR)
     room = layout.rooms[EGO]
     from_facing = np.where(
@@ -121,8 +123,8 @@ def _steps_or_far(steps: np.ndarray, far: int) -> np.ndarray:
     return np.where(steps == NOWHERE, far, steps.astype(int))
 
 
-def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
-    """Return `LayoutFacts.ways`: the steps of the shortest walk from each cell until the ego faces each other cell."""
+def _shortest_walks(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
+    """Return `LayoutFacts.ways`: the steps of the shortest walk from each cell until the ego faces each target cell."""
     room = layout.rooms[EGO].astype(int)
     position = np.zeros(layout.cells, int)  # index of each cell within the ego's room
     position[room] = range(len(room))
@@ -133,7 +135,7 @@ def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
     for action in range(4):
         end = ends[..., action]
         faced = layout.ahead[end, FACING_OF[action]].astype(int)
-        # An action makes the agent face a given cell from at most two cells: it walks from one, and turns on the other.
+        # Turns and moves are handled apart, because each makes the agent face a given cell from at most one cell.
         for walks in (False, True):
             obstacle, start = np.nonzero((end != room) == walks)
             own = obstacle[:, None], room, faced[obstacle, start][:, None]
@@ -142,7 +144,7 @@ def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
 
 
 def _walking_steps(ends: np.ndarray) -> np.ndarray:
-    """Return the steps from each cell of a room to each other cell, uint8 (O, room, room), at most NOWHERE - 2.
+    """Return the steps between all pairs of cells of a room, uint8 (O, room, room); NOWHERE - 2 if unreachable.
 
     Args:
         ends: index within the room of the cell that each move leads to, int (O, room, actions).
@@ -159,11 +161,11 @@ def _walking_steps(ends: np.ndarray) -> np.ndarray:
 
 
 def _hindrance(layout: Layout, tables: Tables) -> np.ndarray:
-    """Return how much the ego would hinder the teammate by waiting on a cell, (3, teammate's cell, ego's cell).
+    """Return how much the ego would hinder the teammate by waiting on a cell, int16 (3, cells, cells).
 
-    The first axis is what the teammate carries: 0 a dish, 1 a plate or an ingredient, 2 nothing. The next cell of each
-    way that the teammate may take counts 16, the neighbours of this cell 8, and cells in front of goals, pots, piles
-    and plates 4.
+    The axes are what the teammate carries (0 a dish, 1 a plate or an ingredient, 2 nothing), the teammate's cell, and
+    the ego's cell. The next cell of each route that the teammate may take counts 16, the neighbours of this cell 8, and
+    cells in front of goals, pots, piles and plates 4.
     """
     # The teammate's target is unknown: any cell where the teammate could use what it carries may be the target.
     used = np.isin(layout.kinds, [GOAL, POT, PILE, PLATES])[layout.ahead].any(axis=1) & layout.walkable

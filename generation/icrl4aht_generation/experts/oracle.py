@@ -1,4 +1,4 @@
-"""Scripted ego that sees the complete state, to estimate how much an ego can add to the return of `stay`.
+"""Scripted ego that sees the complete state, to estimate how much an ego can earn beyond one that never moves.
 
 The oracle is agent 0 and deterministic. It fills one pot at a time with the ingredients that the recipe still needs,
 fetches a plate in time for the soup, and delivers only soups of the current recipe; other soups wait on a counter.
@@ -176,7 +176,7 @@ class OracleView:
     @cached_property
     def steps_to_pots(self) -> Int[Array, "cells P"]:
         """Steps from facing each cell to facing each pot."""
-        return _steps(jnp.asarray(self.facts.leg))
+        return _decode_steps(jnp.asarray(self.facts.leg))
 
     def cost_at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:
         """Return the steps to each of the given pots, plus `then` further steps. All other cells cost NEVER."""
@@ -185,7 +185,10 @@ class OracleView:
 
     @cached_property
     def parking_cost(self) -> Int[Array, " cells"]:
-        """Cost of each counter for putting down an item; low if unshared, or near pots if the ego only cooks."""
+        """Cost of putting down an item on each counter.
+
+        If the ego can serve, counters that only the ego reaches cost less. Otherwise counters near pots cost less.
+        """
         facts = self.facts
         near = 2 * jnp.min(self.steps_to_pots, axis=1, initial=FAR)
         return self.cost(self.scene.empty_counters, jnp.where(facts.serves, 3 * jnp.asarray(facts.shared), near))
@@ -203,15 +206,15 @@ class OracleView:
         """
         trip = jnp.asarray(self.facts.trip)[:, None]
         enough = jnp.all((self.missing >= 0) & ((self.missing == 0) | (trip < FAR)), axis=-1)
-        # A surplus ingredient makes a recipe impossible: nothing can be taken out of a pot.
+        # A surplus ingredient makes a recipe impossible, because no ingredient can be taken out of a pot.
         possible = enough & (self.facts.pots & ~self.full)[:, None]
         current, short = self.recipes == self.recipes[0], self.stock[0] == 0
-        # If the teammate cooks, the ego cooks only the current recipe while no soup of this recipe is in stock, or any
-        # recipe if the current one is impossible. With a soup in stock, the ego cooks ahead, but only in pots that the
-        # teammate does not use.
+        # If the teammate cooks, the ego cooks only the current recipe until a soup of this recipe is in stock.
+        # If the current recipe is impossible, the ego cooks any recipe.
+        # With a soup in stock, the ego cooks ahead, but only in pots that the teammate does not use.
         wanted = jnp.where(short, current, jnp.asarray(self.facts.passed)[:, None]) | (short & ~jnp.any(possible[:, 0]))
         work = jnp.sum(self.missing * jnp.minimum(trip, FAR // 10), axis=-1)
-        # A soup in stock counts more than any walk, because walks are shorter than 200 steps.
+        # A soup in stock adds more to the cost than any walk, because walks are shorter than 200 steps.
         return jnp.where(possible & (wanted | ~self.careful), 200 * (self.stock - current + 1) + work, NEVER)
 
     @cached_property
@@ -222,12 +225,15 @@ class OracleView:
 
     @cached_property
     def must_clear(self) -> Bool[Array, ""]:
-        """Whether the ego must take wrong soups out of pots."""
+        """Whether the ego must take soups of other recipes out of pots."""
         return self.risky | ((self.stock[0] == 0) & (jnp.min(self.plan_costs[:, 0]) == NEVER))
 
     @cached_property
     def teammate_pots(self) -> Bool[Array, " P"]:
-        """Pots left to the teammate: that of the first right soup, if the teammate also cooks and is not idle."""
+        """Pots that the ego leaves to the teammate: the pot whose soup of the current recipe is done first.
+
+        The ego leaves no pot to a teammate that does not cook or is idle.
+        """
         first = jnp.arange(len(self.timers)) == jnp.argmin(jnp.where(self.right, self.timers, NEVER))
         elsewhere = (self.scene.partner_hand & COOKED > 0) | (
             self.scene.holds_plate & (self.scene.partner_hand != PLATE)
@@ -241,7 +247,7 @@ class OracleView:
         """Pots in front of which the ego waits instead of interacting."""
         hand, mixed = self.scene.hand, self.contents + self.scene.hand
         completes = self.careful & (ingredient_count(mixed) == 3)
-        # Start a wrong or a second soup only while a right soup still needs at least WAIT_LIMIT steps.
+        # Start another soup only while a soup of the current recipe cooks for at least WAIT_LIMIT more steps.
         ahead = (mixed != self.recipes[0]) | (self.stock[0] > 0)
         spoils = ahead & ~jnp.any(self.right & (self.timers >= WAIT_LIMIT))
         leaves_it = (self.scene.partner_hand == hand) & (self.memory.calm < WAIT_LIMIT)
@@ -252,7 +258,7 @@ class OracleView:
 
 def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> OracleView:
     state, mine = scene.state, jnp.asarray(facts.mine)
-    # Obstacle 0 means that the teammate blocks no way of the ego.
+    # Obstacle 0 means that the teammate does not block the ego.
     obstacle = jnp.asarray(facts.obstacle)[scene.partner].astype(jnp.int32)
     faced = jnp.asarray(scene.tables.ahead)[scene.me, state.facings[EGO].astype(jnp.int32)]
     items = scene.at(WALL, state.counters)
@@ -269,7 +275,7 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
         scene,
         memory,
         obstacle,
-        time=jnp.where(scene.cell == faced, 0, _steps(jnp.asarray(facts.ways)[obstacle, scene.me])),
+        time=jnp.where(scene.cell == faced, 0, _decode_steps(jnp.asarray(facts.ways)[obstacle, scene.me])),
         items=items,
         sources=(jnp.asarray(facts.piles) | lying) & mine,
         contents=contents,
@@ -285,17 +291,20 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
     )
 
 
-def _steps(stored: UInt8[Array, "*B"]) -> Int[Array, "*B"]:
+def _decode_steps(stored: UInt8[Array, "*B"]) -> Int[Array, "*B"]:
     return jnp.where(stored < NOWHERE, stored.astype(jnp.int32), FAR)
 
 
 def _first_move(view: OracleView, obstacle: Int[Array, ""] | int, target: Int[Array, ""]) -> Int[Array, ""]:
-    """Return the first action of the shortest way to face a cell around an obstacle; INTERACT if already faced."""
+    """Return the first action of the shortest walk around an obstacle until the ego faces the target cell.
+
+    The action is INTERACT if the ego already faces the target cell.
+    """
     scene, ahead = view.scene, jnp.asarray(view.scene.tables.ahead)
     ends = jnp.asarray(scene.tables.moves)[scene.me, :STAY].astype(jnp.int32)
     # The teammate is the obstacle: a move onto its cell only turns the ego.
     ends = jnp.where((ends == scene.partner) & (obstacle > 0), scene.me, ends)
-    after = _steps(jnp.asarray(view.facts.ways)[obstacle, ends, target])
+    after = _decode_steps(jnp.asarray(view.facts.ways)[obstacle, ends, target])
     turn = jnp.argmin(jnp.where(ahead[ends, jnp.asarray(FACING_OF)] == target, 0, after))
     return jnp.where(ahead[scene.me, scene.state.facings[EGO].astype(jnp.int32)] == target, INTERACT, turn)
 
@@ -336,9 +345,9 @@ def _dish_subgoals(view: OracleView) -> list[Subgoal]:
     return [
         # Deliver the current recipe.
         Subgoal(scene.hand == view.dish, view.cost(scene.goals)),
-        # Keep a dish for its recipe: a wrong delivery costs 20.
+        # Keep a dish of another recipe on a counter, because a wrong delivery costs 20.
         Subgoal(scene.holds_dish, view.parking_cost),
-        # Take a ready dish: it earns most per step.
+        # Take a ready dish, because its delivery earns most per step.
         Subgoal(scene.holds_nothing, view.cost(wanted)),
         # Free the hand for a ready dish.
         Subgoal(jnp.any(wanted), view.parking_cost),
@@ -351,12 +360,12 @@ def _plate_subgoals(view: OracleView) -> list[Subgoal]:
     holds, building = view.scene.holds_plate, jnp.min(view.plan_costs) < NEVER
     right = view.right & ~view.teammate_pots
     soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
-    # If a soup is not done when the ego arrives, the ego waits. Each step of waiting costs as much as walking a step.
+    # If a soup is not done when the ego arrives, the ego waits. A step of waiting costs as much as a step of walking.
     rest = jnp.maximum(view.timers - view.pot_times, 0)
     return [
         # Plate the soup of the current recipe.
         Subgoal(holds & (soon | ~building), view.cost_at_pots(right, rest)),
-        # Empty a pot of a wrong soup.
+        # Take a soup of another recipe out of its pot.
         Subgoal(holds & (view.must_clear | ~building), view.cost_at_pots(view.full & ~view.right, rest)),
         # Put the plate down: no soup needs it, but a pot needs ingredients.
         Subgoal(holds, view.parking_cost),
@@ -371,11 +380,11 @@ def _ingredient_subgoals(view: OracleView) -> list[Subgoal]:
     spare = (view.recipes == view.recipes[0]) | (view.stock[0] > 0) | (jnp.sum(fits) > fits)[:, None]
     plans = jnp.min(jnp.where(takes & (spare | ~jnp.any(fits)), view.plan_costs, NEVER), axis=1)
     return [
-        # Cook the recipe in the pot that cost least together.
+        # Put the ingredient into the pot with the lowest cost of walking and cooking.
         Subgoal(holds, view.cost_at_pots(plans < NEVER, plans)),
-        # Fill a spoiled pot to clear it.
+        # Fill up a spoiled pot, because only the soup of a full pot can be taken out.
         Subgoal(holds & ~jnp.any(fits), view.cost_at_pots(view.spoiled_pots)),
-        # Wait at the pot for the teammate, who serves.
+        # Wait at the pot, because only the teammate serves.
         Subgoal(holds & ~view.facts.serves, view.cost_at_pots(view.full | view.mate_delivers)),
         # Put down an ingredient that no recipe needs.
         Subgoal(holds, view.parking_cost),
@@ -387,10 +396,10 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
     empty = scene.holds_nothing
     to_pot = view.steps_to_pots
 
-    def fetch(ingredients: Bool[Array, " types"], then: Array) -> Int[Array, " cells"]:
+    def fetch_cost(ingredients: Bool[Array, " types"], then: Array) -> Int[Array, " cells"]:
         return view.cost(jnp.any(view.sources & ingredients[:, None], axis=0), then)
 
-    def plate_for(which: Bool[Array, " P"]) -> Subgoal:
+    def plate_subgoal(which: Bool[Array, " P"]) -> Subgoal:
         then = jnp.min(jnp.where(which, to_pot, FAR), axis=1)
         return Subgoal(empty & jnp.any(which), view.cost(view.plate_cells, then))
 
@@ -400,7 +409,7 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
     # Count the teammate's ingredient as already in the pot, unless the pots have not changed for WAIT_LIMIT steps.
     delivering = (scene.partner_hand & PLATE == 0) & (view.memory.calm < WAIT_LIMIT)
     coming = scene.counts(scene.partner_hand) * delivering
-    ingredients = fetch(missing > coming, to_pot[:, pot])
+    ingredients = fetch_cost(missing > coming, to_pot[:, pot])
     quick = jnp.sum(missing * jnp.asarray(facts.trip)[pot]) <= WAIT_LIMIT - 4
 
     # The earliest step in which the ego can face each pot after it has fetched a plate.
@@ -408,29 +417,29 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
     due = view.timers <= arrival + 2
     right = view.right & ~view.teammate_pots & facts.serves
     wrong = view.full & ~view.right & view.must_clear & facts.serves
-    any_ingredient = fetch(jnp.any(scene.counts(view.recipes) > 0, axis=0), to_pot[:, jnp.argmax(facts.pots)])
+    any_ingredient = fetch_cost(jnp.any(scene.counts(view.recipes) > 0, axis=0), to_pot[:, jnp.argmax(facts.pots)])
     return [
-        # Finish a pot that needs few steps, then fetch a plate.
+        # Fill up a pot that needs few steps before fetching a plate.
         Subgoal(builds & quick & ~view.risky, ingredients),
-        # Fetch a plate so that it arrives when the soup is done.
-        plate_for(right & due),
-        # Take a wrong soup before the teammate serves it.
-        plate_for(wrong & due & view.risky),
+        # Fetch a plate in time for a soup of the current recipe.
+        plate_subgoal(right & due),
+        # Take a soup of another recipe before the teammate serves it.
+        plate_subgoal(wrong & due & view.risky),
         # Fetch an ingredient to cook.
         Subgoal(builds, ingredients),
         # Wait with a plate, because nothing can be cooked.
-        plate_for(right),
+        plate_subgoal(right),
         # Empty a pot that blocks the current recipe.
-        plate_for(wrong),
+        plate_subgoal(wrong),
         # Fill up a spoiled pot.
         Subgoal(empty & jnp.any(view.spoiled_pots), any_ingredient),
-        # Hold an ingredient ready for the next soup, as an ego that only fills pots.
+        # An ego that only fills pots holds an ingredient ready for the next soup.
         Subgoal(empty & (jnp.any(view.full) | view.mate_delivers) & ~facts.serves, any_ingredient),
     ]
 
 
 def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Array, ""], action: Int[Array, ""]):
-    """Return the action in a shared room, where the ego waits out of the teammate's way and ends mutual blocking."""
+    """Return the action in a shared room, where the ego makes way for the teammate and resolves mutual blocking."""
     scene, facts, still = view.scene, view.facts, view.memory.still
     tables = scene.tables
     ahead = jnp.asarray(tables.ahead)[scene.partner, scene.state.facings[TEAMMATE].astype(jnp.int32)]
@@ -446,7 +455,7 @@ def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Ar
     stays = jnp.arange(STAY + 1) == STAY
     taken = (ends == scene.partner) | ((ends == scene.me) & ~stays) | (stays & pushed)
     faces = jnp.any(jnp.asarray(tables.ahead)[ends] == target, axis=1)
-    away = jnp.where(found & ~faces, _steps(jnp.asarray(facts.ways)[0, ends, target]), 0)
+    away = jnp.where(found & ~faces, _decode_steps(jnp.asarray(facts.ways)[0, ends, target]), 0)
     hindrance = jnp.asarray(facts.hindrance)[carries, scene.partner, ends].astype(jnp.int32)
     aside = jnp.argmin(jnp.where(taken, NEVER, hindrance + away - stays))
 

@@ -40,8 +40,8 @@ def padded_layout(layout: Layout, by_size: bool = False) -> PaddedLayout:
 
     Args:
         layout: layout to pad.
-        by_size: pad only to the largest layout of the same size class: steps are faster, but each class needs a
-            compilation, so this is for long runs.
+        by_size: pad only to the largest layout of the same size class. Steps are then faster, but each class needs a
+            compilation, so the option is for long runs.
     """
     group = known_layouts()
     if by_size:

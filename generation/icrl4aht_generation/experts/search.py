@@ -1,10 +1,10 @@
 """Scripted ego that finds out which dish its teammate wants: it tries dishes, and repeats the dish that was rewarded.
 
 The searcher plays like the oracle, but cooks a believed recipe instead of the current recipe. It remembers over the
-episodes of a task which dishes were refused and which dish was paid (rewarded). Before a dish is paid, the searcher
-believes in the dish that best fits the ingredients that the teammate has put into pots, and breaks ties at random. The
-belief changes only while nothing is being cooked. This ego is for tasks that want one dish in all episodes, see
-`Task.recipes`.
+episodes of a task which dishes earned no reward (refused) and which dish was rewarded (paid). Before any reward, the
+searcher believes in the dish that best fits the ingredients that the teammate has put into pots, and breaks ties at
+random. The belief changes only while nothing is being cooked. This ego is for tasks that want one dish in all episodes,
+see `Task.recipes`.
 
 The searcher can also advise another ego that acts in its place, so that this ego learns to search. Its belief then also
 follows the dish that the ego has begun, because an unrefused dish is as good a try as the searcher's own.
@@ -44,8 +44,8 @@ class SearchMemory(NamedTuple):
     Attributes:
         oracle: memory of the oracle; its record has the believed recipe.
         order: float32 (D,), random numbers below 1 that decide among dishes which fit equally well.
-        refused: bool (D,), dishes that were delivered and not paid.
-        paid: bool (D,), the dish that was paid.
+        refused: bool (D,), dishes that were delivered without a reward.
+        paid: bool (D,), the dish that was rewarded.
         seen: int32 (3,), pieces of each ingredient that the teammate put into pots.
         belief: int32 (), index of the dish that the ego cooks.
     """
@@ -116,14 +116,14 @@ _ADVISING_SEARCHER = Policy((), _initial_memory, partial(_act, advises=True), "s
 def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"], advises: bool) -> SearchMemory:
     """Return the memory updated by the outcome of the previous step."""
     new, old = unpack(view.tables, view.record), unpack(view.tables, memory.oracle.record)
-    # `follows` excludes an episode's first step: random starts are rarely one move from the last positions.
+    # `follows` is False at an episode's first step, because new starts are rarely one move from the last positions.
     moves = jnp.asarray(view.tables.moves)[old.positions.astype(jnp.int32)]
     follows = jnp.all(jnp.any(moves == new.positions[:, None], axis=1))
     ahead = jnp.asarray(view.tables.ahead)[old.positions.astype(jnp.int32), old.facings.astype(jnp.int32)]
     at_goal = jnp.asarray(view.tables.kinds)[ahead.astype(jnp.int32)] == GOAL
     same_pose = (new.positions == old.positions) & (new.facings == old.facings)
     gave = (old.hands & COOKED > 0) & (new.hands == 0) & at_goal & same_pose & follows
-    is_dish = (old.hands[:, None] == dishes | _FLAGS) & gave[:, None]  # (2, D)
+    is_dish = (old.hands[:, None] == dishes | _FLAGS) & gave[:, None]  # bool (2, D)
     # If both agents deliver in one step, the reward does not show whose dish was right.
     paid = memory.paid | (is_dish.any(axis=0) & (new.delivered > 0) & ~gave.all())
     refused = memory.refused | (is_dish[EGO] & (new.delivered == 0))

@@ -34,7 +34,7 @@ class Job(Protocol):
 
     @property
     def label(self) -> str:
-        """Text that describes the job to a person."""
+        """Description of the job for messages."""
         ...
 
     @property
@@ -49,8 +49,8 @@ class Job(Protocol):
 
     @property
     def is_quick(self) -> bool:
-        """Whether the job takes seconds. Quick jobs share a process and its compiled functions; every other job has a
-        new process, which releases its memory."""
+        """Whether the job takes only seconds. Quick jobs share a process and its compiled functions; every other job
+        has a new process, which releases its memory."""
         ...
 
     def is_finished(self) -> bool:
@@ -58,11 +58,11 @@ class Job(Protocol):
         ...
 
     def progress(self) -> tuple[int, float] | None:
-        """Return finished updates and steps per second from the job's folder, perhaps written by another process."""
+        """Return the number of finished updates and the steps per second that the job's folder records."""
         ...
 
     def finished_text(self) -> str:
-        """Return a message on the finished job."""
+        """Return a message that the job is finished."""
         ...
 
     def run(self, on_update: OnUpdate, wait: bool) -> None:
@@ -84,7 +84,7 @@ class JobOutcome:
 
     Attributes:
         job: job that was run.
-        status: "done" if finished now or earlier, "busy" if another process runs the job, or "failed".
+        status: "done" if the job is finished, "busy" if another process runs the job, or "failed".
         attempts: number of attempts.
         error: type and message of the last error.
         trace: traceback of the last error.
@@ -98,7 +98,7 @@ class JobOutcome:
 
 
 def run_job(job: Job, wait: bool, on_update: OnUpdate = lambda update, speed: None) -> Literal["done", "busy"]:
-    """Run a job in this process, and return whether it is done or another process is busy with it."""
+    """Run a job in this process, and return "done", or "busy" if another process runs the job."""
     try:
         job.run(on_update, wait)
     except BusyError:

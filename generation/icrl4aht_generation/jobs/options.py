@@ -29,7 +29,7 @@ class QueueOptions:
 
 
 def request_determinism() -> None:
-    """Make XLA choose only deterministic GPU operations; call this before JAX is first used.
+    """Make XLA choose only deterministic GPU operations; call this function before JAX is first used.
 
     Operations on a CPU are deterministic. By default XLA chooses GPU operations by measured speed, and some of these
     operations sum in varying order.

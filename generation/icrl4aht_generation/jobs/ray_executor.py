@@ -1,6 +1,6 @@
 """Run jobs on Ray, which schedules jobs, assigns a GPU to each if the machines have any, and retries failed jobs.
 
-A Ray that this module starts listens only on 127.0.0.1, without dashboard and usage reports.
+If this module starts Ray, Ray listens only on 127.0.0.1, and has no dashboard and no usage reports.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from icrl4aht_generation.jobs.options import QueueOptions
 
 _POLL_SECONDS = 1.0
 _CONNECT_SECONDS = 10.0
-_OBJECT_STORE_BYTES = 100 * 2**20  # a small store is enough, since results go to the disk and not through Ray
+_OBJECT_STORE_BYTES = 100 * 2**20  # a small store is enough, because jobs write their results to the disk
 
 
 def run_on_ray(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
-    """Run jobs as soon as workers are free; all machines must share the folders of the jobs.
+    """Run jobs as soon as workers are free; all machines must have access to the jobs' folders.
 
     Raises:
         OptionError: if Ray is not installed, or cannot be reached.
     """
     if not jobs:
         return
-    with _connected(options) as ray:
+    with _ray_connection(options) as ray:
         accelerated = ray.cluster_resources().get("GPU", 0) > 0
         remote = ray.remote(
             num_cpus=1,
             num_gpus=int(accelerated),
-            max_calls=1,  # a new process for every job, since its end releases the memory
+            max_calls=1,  # every job has a new process, whose end releases the memory
             max_retries=options.retries,
             retry_exceptions=True,
         )(run_in_worker)
@@ -70,12 +70,12 @@ def _check_reachable(address: str | None) -> None:
         socket.create_connection((host, int(port)), timeout=_CONNECT_SECONDS).close()
     except (OSError, OverflowError, UnicodeError) as error:
         raise OptionError(
-            f"Ray at {address} cannot be reached: {error}; check the address, and `ray status`"
+            f"Ray at {address} cannot be reached: {error}; check the address, and the output of `ray status`"
         ) from error
 
 
 @contextmanager
-def _connected(options: QueueOptions) -> Iterator[Any]:
+def _ray_connection(options: QueueOptions) -> Iterator[Any]:
     settings: dict[str, Any] = {"address": options.address or "local", "log_to_driver": False, "logging_level": "ERROR"}
     if options.address is None:
         # Ray reads this variable when it is imported. Despite its name, it makes Ray listen only on 127.0.0.1.
@@ -88,7 +88,9 @@ def _connected(options: QueueOptions) -> Iterator[Any]:
             "object_store_memory": _OBJECT_STORE_BYTES,
         }
     elif options.workers is not None:
-        raise OptionError(f"workers = {options.workers}: the Ray cluster at {options.address} sets the number; omit it")
+        raise OptionError(
+            f"workers = {options.workers}: the Ray cluster at {options.address} sets the number; omit the option"
+        )
     try:
         import ray
     except ImportError as error:
@@ -97,7 +99,7 @@ def _connected(options: QueueOptions) -> Iterator[Any]:
     try:
         ray.init(**settings)
     except (ConnectionError, ValueError, RuntimeError) as error:
-        raise OptionError(f"Ray at {options.address or 'this machine'} cannot be reached: {error}") from error
+        raise OptionError(f"Ray at {options.address or 'localhost'} cannot be reached: {error}") from error
     try:
         yield ray
     finally:

@@ -1,4 +1,4 @@
-"""Draw fixtures, recipes and starts of new layouts for given rooms, and check that agents can deliver the recipes.
+"""Draw fixtures, recipes and start cells for given rooms, and check that agents can deliver the recipes.
 
 Shapes: `H` rows, `W` columns.
 """
@@ -22,15 +22,15 @@ FREE_COUNTERS = 2
 LayoutDraw = tuple[tuple[str, ...], tuple[tuple[int, int, int], ...], bool]
 """Arguments of a `Layout` after its names: map, recipes, and whether the layout has a delivery indicator."""
 
-_INGREDIENT_IDS = 4  # ids 0 to 3 have canonical channels
-_MOST = {"P": 3, "L": 2}  # maximum copies of a fixture; other fixtures have no limit
+_INGREDIENT_IDS = 4  # ingredients 0 to 3 have canonical channels
+_MOST = {"P": 3, "L": 2}  # maximum number of copies of pots and buttons; other fixtures have no limit
 _ARRANGEMENTS = 60  # maximum number of tries to place the chosen fixtures
 
 
 def needs_no_handover(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple[int, int, int]]) -> bool:
     """Return whether two agents in separate rooms can deliver every recipe without handing items over on counters.
 
-    The scripted experts need this: either one agent does everything, or one agent only cooks, in pots that both agents
+    The scripted experts require that one agent does everything, or that one agent only cooks, in pots that both agents
     reach, and the other agent only serves.
 
     Args:
@@ -51,8 +51,8 @@ def needs_no_handover(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tup
 def waiting_cells(grid: np.ndarray, room: np.ndarray, recipes: Sequence[tuple[int, int, int]]) -> np.ndarray:
     """Return the cells of a shared room on which one agent can wait while the other delivers every recipe alone.
 
-    All other cells are the only access to a pot, or to all fixtures of a kind that a recipe needs. Every single pot
-    counts, because the scripted expert may wait for a blocked pot. No cell may divide the room into two parts.
+    All other cells are the only access to a pot, or to all fixtures of a kind that a recipe needs. Every pot counts,
+    because the scripted expert may wait for a blocked pot. The room must stay connected without any single cell.
 
     Args:
         grid: the map, str (H, W).
@@ -84,9 +84,9 @@ def faced_cells(rooms: np.ndarray) -> np.ndarray:
 
 
 def furnish_rooms(rooms: np.ndarray, rng: np.random.Generator) -> LayoutDraw | None:
-    """Return a layout with these rooms and random fixtures, recipes and starts.
+    """Return a layout with the given rooms and random fixtures, recipes and start cells.
 
-    The scripted experts can deliver soups on the result, see `needs_no_handover` and `waiting_cells`. In a shared room,
+    The scripted experts can deliver soups on the layout, see `needs_no_handover` and `waiting_cells`. In a shared room,
     one agent starts on one of the `waiting_cells`.
 
     Args:

@@ -59,9 +59,9 @@ def _wide_images(height: int, width: int) -> tuple[np.ndarray, int]:
 def canonical_map(layout: Layout) -> tuple[str, ...]:
     """Return the canonical map of a layout, which is equal for all layouts that differ only by symmetry.
 
-    The result is the alphabetically first mirror image or rotation that is not taller than wide. Starts are moved to
-    the first cells of the agents' rooms, because episodes start anywhere in a room. Recipes and the delivery indicator
-    have no influence.
+    The result is the alphabetically first mirror image or rotation that is not taller than wide. Start cells are moved
+    to the first cells of the agents' rooms, because episodes start anywhere in a room. Recipes and the delivery
+    indicator have no influence.
     """
     images, width = _wide_images(layout.height, layout.width)
     letters = np.frombuffer("".join(layout.rows).replace("A", " ").encode("ascii"), np.uint8)[images]
@@ -75,7 +75,7 @@ def canonical_map(layout: Layout) -> tuple[str, ...]:
 
 
 def canonical_floor(floor: np.ndarray) -> tuple[str, ...]:
-    """Return the alphabetically first mirror image or rotation, not taller than wide, of a floor, bool (H, W)."""
+    """Return the alphabetically first mirror image or rotation of a floor, bool (H, W), not taller than wide."""
     images, width = _wide_images(*floor.shape)
     return _first_rows(np.where(floor.ravel()[images], ord(" "), ord("W")).astype(np.uint8), width)
 

@@ -1,4 +1,4 @@
-"""Test layouts by playing episodes: whether the oracle, alone or with a second oracle, delivers a soup."""
+"""Find out by playing episodes whether an oracle, or a pair of oracles, delivers a soup on a layout."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _THOROUGH = ((4, _BOTH, True), (4, _EGO, True), (4, _TEAMMATE, True), (4, _BOTH,
 the map's start cells instead of random cells. Few layouts need the thorough tries."""
 
 
-def layouts_delivered(
+def are_playable(
     layouts: Sequence[Layout], checked: Callable[[int], None] = lambda count: None
 ) -> Bool[np.ndarray, " layouts"]:
-    """Return for each layout whether one or two oracles deliver at least once in an episode of 400 steps.
+    """Return for each layout whether one or two oracles deliver a soup in an episode of 400 steps.
 
     Args:
         layouts: layouts to test.
@@ -59,7 +59,7 @@ def _can_deliver(
     numbers: np.ndarray,
     tries: Sequence[tuple[int, tuple[bool, bool], bool]],
 ) -> Bool[np.ndarray, " numbers"]:
-    # All batches share a compilation: the largest layouts give them equal shapes, and short batches repeat layouts.
+    # All batches share one compilation, because the largest layouts in each batch give its arrays equal shapes.
     own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
     # Computing `LayoutFacts` takes longer than an episode, so all tries of a batch share the result.

@@ -20,7 +20,7 @@ MOST_REPEATS = 1000
 
 
 def with_four_recipes(layout: Layout) -> Layout:
-    """Return a layout with the four recipes that the protocol `published` has on the layout track.
+    """Return a layout with the four recipes that the protocol `published` uses on the layout track.
 
     Raises:
         OptionError: if the layout has no pile of an ingredient that the recipes need.
@@ -34,9 +34,9 @@ def with_four_recipes(layout: Layout) -> Layout:
 def rearranged_layouts(layout: Layout, count: int) -> list[Layout]:
     """Return layouts with the same rooms, and with counters, piles, pots and other fixtures in other cells.
 
-    A fixture moves only to cells that the same agents reach, because otherwise soups might be impossible. No result is
-    a published layout or its mirror image. Every second layout has the four recipes of `with_four_recipes`. A smaller
-    count returns the first layouts of a larger count.
+    A fixture moves only to cells that the same agents reach, because otherwise a recipe might be impossible. No result
+    is a published layout or its mirror image. Every second layout has the four recipes of `with_four_recipes`. A
+    smaller count returns the first layouts of a larger count.
 
     Args:
         layout: layout to rearrange.

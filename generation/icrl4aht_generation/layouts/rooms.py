@@ -17,15 +17,15 @@ from icrl4aht_generation.layouts.templates import published_rooms
 
 MOST_ROWS, MOST_COLUMNS = 9, 11
 
-_FEWEST_CELLS = 6  # minimum size of a shared room
+_FEWEST_CELLS = 6  # minimum number of cells in the first rectangle of a shared room
 
 
 def draw_rooms(seed: int) -> Iterator[LayoutDraw]:
-    """Yield layouts with new rooms of the three kinds in turn; the rooms differ from those of all published layouts."""
+    """Yield layouts with a shared room, two rooms and a ring in turn; no published layout has these rooms."""
     rng = np.random.default_rng([seed, *b"rooms"])
     published = published_rooms(tested=False) | published_rooms(tested=True)
     while True:
-        for draw in (_shared_room, _two_rooms, _ring):
+        for draw in (_shared_room, _two_rooms, _ring_room):
             drawn = None
             while drawn is None:
                 rooms = np.stack(draw(rng))
@@ -37,7 +37,7 @@ def draw_rooms(seed: int) -> Iterator[LayoutDraw]:
 def _shared_room(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return a shared room of one to three rectangles, perhaps with islands of one counter.
 
-    No agent can block the way of the other: rectangles are at least two cells wide and overlap in at least two cells,
+    Neither agent can block the other: rectangles are at least two cells wide and overlap in at least two cells,
     and islands are surrounded by floor.
     """
     floor = np.zeros((MOST_ROWS, MOST_COLUMNS), bool)
@@ -54,7 +54,7 @@ def _shared_room(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         surrounded = np.argwhere(binary_erosion(floor, np.ones((3, 3), bool)))
         if len(surrounded):
             floor[tuple(rng.choice(surrounded))] = False
-    floor = np.pad(floor[find_objects(floor.astype(int))[0]], 1)  # cropped to its cells and a border of walls
+    floor = np.pad(floor[find_objects(floor.astype(int))[0]], 1)  # cropped to the room and a border of walls
     return floor, floor
 
 
@@ -86,8 +86,8 @@ def _is_room(floor: np.ndarray) -> bool:
     return floor.sum() > 1 and connected[1] == 1
 
 
-def _ring(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return a room around an island of at least two counters; the ways around the island may be one cell wide."""
+def _ring_room(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return a room around an island of at least two counters; the paths around the island may be one cell wide."""
     while True:
         height, width = rng.integers(3, MOST_ROWS - 1), rng.integers(3, MOST_COLUMNS - 1)
         tall, wide = rng.integers(1, height - 1), rng.integers(1, width - 1)

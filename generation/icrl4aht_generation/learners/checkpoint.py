@@ -66,7 +66,7 @@ def load_card(folder: Path) -> dict[str, Any]:
     except IndexFormatError as error:
         raise _checkpoint_error(folder, repr(error)) from error
     if not isinstance(card, dict):
-        raise _checkpoint_error(folder, f"{POLICY_CARD} is not an object")
+        raise _checkpoint_error(folder, f"{POLICY_CARD} is not a JSON object")
     return card
 
 
@@ -92,9 +92,9 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
 
 
 def _without_zero_rows(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the weights to store, where a matrix of mostly zero rows is reduced to its nonzero rows and their indices.
+    """Return the weights to store: a matrix of mostly zero rows is reduced to its nonzero rows and their indices.
 
-    This shortens the kernel of encoder `mlp`, because most entries of the flat window are always 0 on a layout.
+    This shortens the kernel of encoder `mlp`, because most entries of flat observations are always 0 on a layout.
     """
     stored = {}
     for name, matrix in weights.items():
@@ -118,7 +118,7 @@ def _with_zero_rows(stored: dict[str, np.ndarray], shapes: dict[str, list[int]])
         name = name.removesuffix(_ROWS)
         length, width = shapes[name]
         if length * width * weights[name].itemsize > CHECKPOINT_BYTES:
-            raise ValueError(f"{name}: shape {shapes[name]} is larger than any checkpoint")
+            raise ValueError(f"{name}: expected at most {CHECKPOINT_BYTES:,} bytes, found the shape {shapes[name]}")
         complete = np.zeros((length, width), weights[name].dtype)
         complete[stored[name + _ROWS]] = weights[name]
         weights[name] = complete

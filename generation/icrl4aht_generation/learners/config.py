@@ -111,5 +111,5 @@ class PPOConfig:
 
     @property
     def episodes(self) -> int:
-        """Number of episodes per environment that the updates cover up to the state after the last stored step."""
+        """Number of episodes per environment whose stored steps, and the state after them, the updates cover."""
         return max(0, (self.updates * self.rollout - KEPT_STEPS - 1) // EPISODE_STEPS + 1)

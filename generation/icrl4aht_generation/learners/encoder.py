@@ -1,4 +1,4 @@
-"""The encoder of observations, for learners and sequence models: convolutions, or one dense layer of the flat window.
+"""Encoder of observations for learners and sequence models: convolutions, or a dense layer on flat observations.
 
 Inputs are observations, or a compact form that is computed from state records. Both forms have equal parameters, and
 equal results up to the order of summation. `WindowWords` are for the convolutions: a 1 x 1 convolution sees one cell,
@@ -82,7 +82,7 @@ class CompactView:
     Attributes:
         kind: kind of the encoder.
         layouts: layouts of the records.
-        agents: agents that observe, each as the first agent of its state records; see `CellWords.entries`.
+        agents: agents that observe; an agent comes first in its own state records, see `CellWords.entries`.
         canonical: whether observations have the canonical channels instead of the layouts' channels.
     """
 
@@ -147,7 +147,7 @@ def group_equal(seen: Seen) -> Seen:
     group_of_sorted = jnp.cumsum(starts, dtype=jnp.int32) - 1
     group = jnp.zeros_like(number).at[order].set(group_of_sorted, unique_indices=True)
     first = jnp.zeros_like(number).at[jnp.where(starts, group_of_sorted, len(ids))].set(order, mode="drop")
-    # Different observations with equal hashes are very unlikely, but would be confused without an error.
+    # Different observations rarely have equal hashes, but this test prevents that they are merged silently.
     exact = (ids[first[group]] == ids).all()
     first, group = (jnp.where(exact, found, number) for found in (first, group))
     count = jnp.where(exact, group_of_sorted[-1] + 1, len(ids))
@@ -239,10 +239,10 @@ class WindowEncoder(nn.Module):
 
 
 class FlatDense(nn.Module):
-    """Dense layer of flat observations; the kernel has a row for each of 25 * C entries, also for compact inputs.
+    """Dense layer on flat observations; the kernel has a row for each of 25 * C entries, also for compact inputs.
 
-    Rows of entries that are always 0 in `view` start as zeros: these rows never learn, and random rows would add noise
-    on other layouts.
+    Rows of entries that are always 0 in `view` start as zeros: these rows have no gradient, and random rows would
+    add noise on other layouts.
     """
 
     features: int
@@ -289,7 +289,7 @@ class Conv3x3(nn.Module):
 
 
 def _tap_of_cells() -> np.ndarray:
-    """Return the index of the kernel tap between input and output cells, int (25, 25); 9 for cells not adjacent."""
+    """Return the kernel tap of each pair of input and output cells, int (25, 25); 9 if the cells are not adjacent."""
     cell = np.arange(VISIBLE)
     dy = cell[:, None] // WINDOW - cell // WINDOW + 1
     dx = cell[:, None] % WINDOW - cell % WINDOW + 1

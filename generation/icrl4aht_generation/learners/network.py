@@ -1,7 +1,8 @@
 """The CNN-GRU actor-critic of teammates and egos (paper, App. B.1 and C.2.1), in a form that is fast on a CPU.
 
 N denotes sequences, T steps. Parameters and outputs equal those of ordinary convolutions and a GRU cell, but the order
-of computation differs: see `encoder`, and the GRU's input products are computed for all steps outside the scan.
+of computation differs: the GRU's products with the input are computed for all steps before the scan. For the
+convolutions, see `encoder`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from icrl4aht_generation.learners.encoder import CompactView, Seen, WindowEncode
 
 
 class GRU(nn.Module):
-    """A GRU over time that starts from zero where `reset` is set, with the parameters of `flax.linen.GRUCell`."""
+    """A GRU over time, with the parameters of `flax.linen.GRUCell`; the state is set to zero where `reset` is true."""
 
     width: int
 
@@ -63,7 +64,7 @@ def _scan_states(hidden, gates, reset, recurrent, bias):
     def step(hidden, inputs):
         gates, reset = inputs
         before = jnp.where(reset[:, None], 0.0, hidden)
-        # One product for all three gates is faster than three.
+        # One matrix product for all three gates is faster than three products.
         own = before @ recurrent
         r, z = jnp.split(nn.sigmoid(gates[:, : 2 * width] + own[:, : 2 * width]), 2, axis=-1)
         memory = own[:, 2 * width :] + bias
@@ -106,7 +107,7 @@ recurrent_states.defvjp(_scan_states, _states_gradient)
 
 
 class ActorCritic(nn.Module):
-    """Recurrent actor-critic: sequences of observations to action logits and values.
+    """Recurrent actor-critic that maps sequences of observations to action logits and values.
 
     Args:
         widths: encoder and layer widths.

@@ -28,11 +28,11 @@ DEMO = tasks_of("teammate", "demo_wide")
 def test_tasks_on_which_the_oracle_gains_little_are_dropped():
     """Headroom is stored by layout and family for test tasks, and by teammate for validation tasks."""
     flat = {task.layout.name for task in tasks_of("teammate")} - {
-        task.layout.name for task in responses.with_headroom(tasks_of("teammate"))
+        task.layout.name for task in responses.tasks_with_headroom(tasks_of("teammate"))
     }
     assert flat == {"coord_simple", "test_simple"}
     validation = bundled_tasks("teammate", "validation")
-    assert 0 < len(responses.with_headroom(validation)) < len(validation)
+    assert 0 < len(responses.tasks_with_headroom(validation)) < len(validation)
 
 
 @pytest.mark.slow

@@ -356,7 +356,7 @@ class TestHeldOut:
             ("ad", 121, {}, r"context = 121: the shortest history of .* has 120 steps for a window"),
             ("ad", 41, {"every": 3}, "context = 41: .* has 40 steps .* every = 3 and first = all;"),
             ("ad", 61, {"first": 3}, "context = 61: .* has 60 steps .* every = 1 and first = 3;"),
-            ("dpt", 7, {"every": 2}, "every = 2: dpt learns from contexts of one part"),
+            ("dpt", 7, {"every": 2}, "every = 2: dpt learns from contexts, but only windows can skip episodes"),
             ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
         ],
     )
@@ -368,7 +368,7 @@ class TestHeldOut:
 
     def test_dpt_training_without_labels_raises_error(self, tmp_path):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
-        with pytest.raises(LabelsMissingError, match=r"have no expert actions.*: use labels that all have"):
+        with pytest.raises(LabelsMissingError, match=r"have no expert actions.*: use labels that all histories have"):
             training_job(tmp_path / "r", "dpt")
 
 

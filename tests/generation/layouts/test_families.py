@@ -191,4 +191,4 @@ def test_oracles_deliver_on_generated_layouts(samples, monkeypatch):
     monkeypatch.setattr(playable, "_AT_ONCE", 4)  # the layouts are played in two batches
     idle = Layout("idle", "idle", ("WWWWWW", "WA  WW", "WAW0PB", "WWWWXW"), recipes=((0, 0, 0),))
     layouts = [one for family in LAYOUT_FAMILIES for one in samples[family][:2]]
-    assert playable.layouts_delivered([*layouts, idle]).tolist() == [True] * len(layouts) + [False]
+    assert playable.are_playable([*layouts, idle]).tolist() == [True] * len(layouts) + [False]

@@ -47,8 +47,10 @@ def pairs_assignment(members: int, environments: int) -> Assignment:
 
 @dataclass(frozen=True)
 class BRDiv(Algorithm):
-    """L(pi_k) = -w_SP J(pi_k, BR_k) + w_XP sum_{j != k} J(pi_k, BR_j), with w_SP = 1 + 2 w_XP (paper, App. B.1, BRDiv
-    "Training Objective"); best responses maximize their return with their own confederate only.
+    """BRDiv: confederate k minimizes L(pi_k) = -w_SP J(pi_k, BR_k) + w_XP sum_{j != k} J(pi_k, BR_j).
+
+    The weight w_SP is 1 + 2 w_XP (paper, App. B.1, BRDiv "Training Objective"). Best responses maximize their return
+    with their own confederate only.
 
     Attributes:
         members: number K of confederates.

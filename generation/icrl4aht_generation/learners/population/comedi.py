@@ -1,5 +1,6 @@
-"""CoMeDi: members trained in turn, each good with itself and bad with its most compatible member (Sarkar et al. 2023;
-paper, App. B.1). The first member is trained by self-play, like the members of FCP.
+"""CoMeDi: each new member learns to play well with itself, and badly with its most compatible earlier member.
+
+Source: Sarkar et al. 2023; paper, App. B.1. The first member is trained by self-play, like the members of FCP.
 
 Policy 0 is the new member, which is also its own best response, as in the original. Policy 1 is a frozen member. Each
 of four kinds of play has a quarter of the environments:
@@ -28,8 +29,9 @@ _SP, _XP, _MP_SELF, _MP_FROZEN = range(4)
 
 @dataclass(frozen=True)
 class CoMeDi(Algorithm):
-    """L = -J_SP + alpha J_XP - beta J_MP (paper, App. B.1, CoMeDi "Training Objective"), where the partner of J_MP is
-    the new member or the frozen member, each in half of the episodes.
+    """CoMeDi: a new member minimizes L = -J_SP + alpha J_XP - beta J_MP (paper, App. B.1, CoMeDi "Training Objective").
+
+    The partner in the mixed play of J_MP is the new member in half of the episodes, and the frozen member in the rest.
 
     Attributes:
         cross_play_weight: weight alpha of cross-play returns.

@@ -27,7 +27,7 @@ class FCP(Algorithm):
     def assignment(self, environments: int) -> Assignment:
         """Return the assignment, with one term for each member: the member's self-play return."""
         member = np.repeat(np.arange(self.members), environments)
-        # A member plays both slots. Both are samples of its self-play return, and it learns from both.
+        # A member plays both agents, and learns from both slots, which are samples of its self-play return.
         both = np.stack([member, member])
         return Assignment(both, both, np.arange(self.members), self.members, np.full(member.size, -1))
 

@@ -35,10 +35,10 @@ class Multipliers(NamedTuple):
 
 @dataclass(frozen=True)
 class LBRDiv(Algorithm):
-    """Maximise sum_i J(pi_i, BR_i) under J(pi_i, BR_i) >= J(pi_j, BR_i) + eps and J(pi_i, BR_i) >= J(pi_i, BR_j) + eps
-    (paper, App. B.1, LBRDiv).
+    """LBRDiv: maximize sum_i J(pi_i, BR_i) under two constraints for each pair i != j (paper, App. B.1, LBRDiv).
 
-    In the Lagrangian, the return of confederate i with its own best response has the weight
+    The constraints are J(pi_i, BR_i) >= J(pi_j, BR_i) + eps and J(pi_i, BR_i) >= J(pi_i, BR_j) + eps. In the
+    Lagrangian, the return of confederate i with its own best response has the weight
     sum_j (vertical_ij + horizontal_ij), and with another best response j the weight -(horizontal_ij + vertical_ji).
     Both policies of a pair have the same weight. The multipliers are updated with the returns of training episodes.
 
@@ -67,7 +67,7 @@ class LBRDiv(Algorithm):
         return jnp.concatenate([pairs.ravel(), pairs.ravel()])
 
     def adapt(self, memory: Multipliers, returns, seen) -> Multipliers:
-        """Update multipliers: Lambda <- max(Lambda - eta (J(pi_i, BR_i) - J(other) - eps), 0), except the diagonal."""
+        """Return multipliers max(Lambda - eta (J(pi_i, BR_i) - J(other) - eps), 0); the diagonal does not change."""
         k = self.members
         # `returns` is indexed [ego, teammate]; best responses, K..2K-1, are the egos.
         known = memory.known | seen[k:, :k].T
@@ -76,11 +76,11 @@ class LBRDiv(Algorithm):
         own_known = jnp.diag(known)[:, None]
         fresh = jnp.any(seen)  # without new episodes the multipliers do not change
 
-        def updated(multipliers, other, other_known):
+        def updated_multipliers(multipliers, other, other_known):
             step = self.learning_rate * (own - other - self.tolerance)
             changed = jnp.maximum(multipliers - jnp.where(own_known & other_known & fresh, step, 0.0), 0.0)
             return jnp.where(jnp.eye(k) > 0, _SELF_PLAY, changed)
 
-        vertical = updated(memory.vertical, latest.T, known.T)
-        horizontal = updated(memory.horizontal, latest, known)
+        vertical = updated_multipliers(memory.vertical, latest.T, known.T)
+        horizontal = updated_multipliers(memory.horizontal, latest, known)
         return Multipliers(vertical, horizontal, latest, known)

@@ -73,7 +73,7 @@ class Assignment(NamedTuple):
 
     @property
     def self_play(self) -> np.ndarray:
-        """Whether two policies of one group play in each environment, bool (N,)."""
+        """Whether the two policies in each environment are of one group, bool (N,)."""
         return self.group[self.policy[0]] == self.group[self.policy[1]]
 
 
@@ -110,7 +110,7 @@ class PolicyGroup(NamedTuple):
     Attributes:
         first: number of the first policy.
         agent_slots: int (G, M), slots of each policy; slots from which the policy learns come first.
-        counting: number of the M slots from which each policy learns.
+        counting: number of slots, of the M slots, from which each policy learns.
     """
 
     first: int
@@ -122,11 +122,11 @@ class PolicyGroup(NamedTuple):
         return slice(self.first, self.first + len(self.agent_slots))
 
     def take(self, tree: Any) -> Any:
-        """Return the group's rows of leaves (P, ...)."""
+        """Return the group's rows of a tree with leaves (P, ...)."""
         return jax.tree.map(lambda leaf: leaf[self._rows], tree)
 
     def put(self, tree: Any, rows: Any) -> Any:
-        """Return a tree of leaves (P, ...) with the group's rows replaced."""
+        """Return a tree with leaves (P, ...) after replacing the group's rows."""
         return jax.tree.map(lambda leaf, new: leaf.at[self._rows].set(new), tree, rows)
 
 
@@ -181,7 +181,7 @@ class Population:
 
     @cached_property
     def network(self) -> ActorCritic:
-        """The network of all policies."""
+        """The network that all policies use, each with its own parameters."""
         policies = self.assignment.policies
         # The partner's number is useless to a policy that always has the same partner.
         pairs = set(zip(self.assignment.policy.ravel(), self.assignment.partner, strict=True))
@@ -291,7 +291,7 @@ class Population:
         shaping = shaping_weight(self.config, state.update)
         params, optimizer, losses = state.params, state.optimizer, []
         for number, (group, player) in enumerate(zip(self.groups, players, strict=True)):
-            if group.first >= self.assignment.learning:  # frozen policies only play
+            if group.first >= self.assignment.learning:  # frozen policies do not learn
                 continue
             slots = player.agent_slots
             last, _ = player.act(carry.memories[number], carry.env, key)
@@ -303,7 +303,7 @@ class Population:
             played = played._replace(partner=partner, weight=weight[slots][None])
 
             def by_policy(leaf, shape=group.agent_slots.shape, counting=group.counting):
-                """Reshape an array (T, G * M, ...) to (G, T, counting, ...), without slots that only play."""
+                """Reshape an array (T, G * M, ...) to (G, T, counting, ...), with only the slots to learn from."""
                 return jnp.moveaxis(leaf.reshape(leaf.shape[0], *shape, *leaf.shape[2:]), 1, 0)[:, :, :counting]
 
             # Every policy starts from its old parameters, so the order of the groups does not matter.
@@ -342,7 +342,7 @@ class Population:
         return raw * scale[policy]
 
     def _returns(self, rollout: Rollout) -> tuple[Float[Array, "P P"], Bool[Array, "P P"]]:
-        """Return the mean return of ended episodes for each ego and teammate policy, and whether any episode ended."""
+        """Return the mean return of ended episodes for each pair of policies, and whether any episode ended."""
         size = (self.assignment.policies,) * 2
         pairs = tuple(self.assignment.policy)
         # Several environments have the same pair of policies, so `at[].add` sums over these environments.
@@ -357,7 +357,7 @@ class Population:
             done = rollout.done & envs
             return jnp.sum(jnp.where(done, rollout.returns, 0.0)) / jnp.maximum(jnp.sum(done), 1)
 
-        # Returns of episodes that start from visited states are not comparable.
+        # Episodes that start from visited states are left out, because their returns are not comparable.
         usual_start = self.assignment.starts_from < 0
         self_play = self.assignment.self_play
         return {
