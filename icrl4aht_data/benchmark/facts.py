@@ -169,7 +169,7 @@ def track_of(layout: str) -> str:
     "layout".
 
     Raises:
-        UnknownNameError: if no track includes it.
+        UnknownNameError: if no track includes the layout.
     """
     name = layout.removesuffix(PLAIN)
     for track, splits in TRACKS.items():
@@ -186,7 +186,7 @@ def layout_order(layout: str) -> tuple[int, str]:
 
 
 def layout_number(layout: str) -> int:
-    """Return the number of a layout (short name) to derive seeds from: its position in `LAYOUT_NAMES`.
+    """Return the number from which seeds on a layout (short name) are derived: its position in `LAYOUT_NAMES`.
 
     A registered layout's number is a hash of its name, so the number does not depend on the installed packages.
     """

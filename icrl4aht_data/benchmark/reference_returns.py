@@ -21,13 +21,13 @@ Cell = tuple[str, str]
 
 
 def read_headroom(protocol: str) -> dict[Cell, dict[str, float]]:
-    """Return the reference egos' mean returns by (layout, family); empty if the protocol was not measured."""
+    """Return the reference egos' mean returns by (layout, family); empty for a protocol without measurements."""
     content = json.loads(card_file("headroom.json").read_text(encoding="utf-8")).get(protocol, {})
     return {(layout, family): agents for layout, families in content.items() for family, agents in families.items()}
 
 
 def stay_returns(protocol: str) -> dict[str, float]:
-    """Return the mean return of the ego `stay` by task id; empty if the protocol was not measured."""
+    """Return the mean return of the ego `stay` by task id; empty for a protocol without measurements."""
     return json.loads(card_file("stay.json").read_text(encoding="utf-8")).get(protocol, {})
 
 

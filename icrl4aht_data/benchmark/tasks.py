@@ -220,7 +220,7 @@ class _RlTheta(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _Teammate(msgspec.Struct, forbid_unknown_fields=True):
-    """Fields of a task's entry `teammate`; manifests of the published code may also have the agent's slot."""
+    """Fields of a task's `teammate`; manifests of the published code may also have the teammate's slot."""
 
     kind: Literal["heuristic", "rl"]
     family: str

@@ -116,7 +116,7 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
     values["rewards"][last] = 0
     for name in (name for name in ACTION_FIELDS if entry.has(FIELDS[name])):
         if name == "oracle_actions" and entry.source == "noise" and "expert_actions" in values:
-            continue  # the expert of a noise history is the oracle
+            continue  # histories made with action noise have the same oracle and expert actions
         values[name] = history.read(name)[steps].astype(np.uint8)
         _require(history, int(values[name].max()) < len(ACTIONS), f"{name} below {len(ACTIONS)}", values[name].max())
         values[name][last] = NO_ACTION

@@ -1,1 +1,1 @@
-"""OvercookedV2 for NumPy and JAX arrays, batch axes first: layouts, state records, rules, observations, pictures."""
+"""OvercookedV2 for batches in NumPy or JAX arrays: layouts, state records, rules, observations and pictures."""

@@ -1,4 +1,4 @@
-"""Constants of cells, items and windows, which layouts, rules and observations share.
+"""Constants of cells, items and windows, shared by layouts, rules and observations.
 
 A cell (x, y) has column x and row y, from the top left corner; the cell's number is y * width + x.
 """

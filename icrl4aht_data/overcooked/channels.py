@@ -35,7 +35,7 @@ def canonical_positions(layout: Layout) -> np.ndarray:
     """Return the canonical position of each of a layout's own channels, int64 (C,), ascending.
 
     Raises:
-        OptionError: if an ingredient of the layout has no canonical channel, since no published layout has it.
+        OptionError: if an ingredient of the layout has no canonical channel, that is, if no published layout has it.
     """
     names = channel_names(layout)
     missing = [name for name in names if name not in CANONICAL_CHANNELS]

@@ -284,7 +284,7 @@ def _draw_view(layout: Layout, canvas: Canvas, x: float, y: float, cell: int) ->
 
 
 def _draw_chef(layout: Layout, agent: int, canvas: Canvas, x: float, y: float, facing: int, hand: int) -> None:
-    """Draw an agent as a chef seen from above, in the agent's colour, turned in the direction of its facing."""
+    """Draw an agent as a chef seen from above, in the agent's colour, turned the way the agent faces."""
     forward = STEP[FACINGS[facing]]
     body = [
         (0.42, AGENT_COLOURS[agent], (-0.16, -0.2), (-0.16, 0.2)),

@@ -23,7 +23,7 @@ from icrl4aht_data.overcooked.state import columns, possible_recipes, record_siz
 from icrl4aht_data.utils.system import run_in_slices
 
 _SLAB = 8192  # steps rendered at a time: in smaller blocks, function calls cost more time than the cache saves
-_IMPOSSIBLE = -(2**40)  # so low that any sum with this table entry is negative
+_IMPOSSIBLE = -(2**40)  # table entry so low that its sum with any other entry is negative
 _TIMERS = 32  # number of values of a five-bit timer
 _ON_COUNTER, _ON_BUTTON, _IN_POT = 0, 256, 512
 """Number of the first patch of each kind of cell. Patch b shows item byte b on a counter, patch 256 + b a lit button
@@ -71,7 +71,7 @@ class _Renderer:
         self._shape = observation_shape(layout, canonical)
         self._columns = columns(layout)
         fixed = fixed_channels(layout, canonical)
-        self._agent: int = fixed.start // 2  # the number A; the channels of both agents come first
+        self._agent: int = fixed.start // 2  # number A of one agent's channels; both agents come first
         self._first: int = fixed.stop  # first channel of items, recipes and timers, which can change
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
         self._recipes = np.append(np.uint8(0), possible_recipes(layout))
@@ -120,8 +120,8 @@ class _Renderer:
         seen = np.flatnonzero(where != NOWHERE)
         row, cell, where = row[seen], cell[seen], where[seen]
         flat, start = np.ascontiguousarray(record).reshape(-1), row * record.shape[1]
-        # A pot with item byte 8 (two pieces of ingredient 0) and timer 0 shows patch 512 + 8; a cooking pot with item
-        # byte 12 and timer 19 shows patch 512 + 19 * 256 + 12. The patch is copied to the pot's cell in the window.
+        # Row 512 + 8 of `_patches` shows a pot with item byte 8 (two pieces of ingredient 0) and timer 0; row
+        # 512 + 19 * 256 + 12 shows a cooking pot with item byte 12 and timer 19. The row is copied to the pot's cell.
         patch = self._first_patch.take(cell) + flat.take(start + self._patch_column.take(cell))
         pots = np.flatnonzero(cell < self._pots)
         timers = flat.take(start[pots] + self._columns.pot_timers.start + cell[pots]).astype(np.intp)
@@ -129,7 +129,7 @@ class _Renderer:
         _as_items(cells[:, self._first :])[row * VISIBLE + where] = self._patches.take(patch)
 
     def _make_pair_lookups(self) -> None:
-        """Make tables intp (2**16,), indexed by two bytes with the low byte first; impossible pairs are negative.
+        """Make tables intp (2**16,), indexed by two bytes with the low byte first; entries of impossible pairs are < 0.
 
         The entries of `_by_positions` and `_by_recipe` add up to the row of the background.
         """
@@ -171,7 +171,7 @@ class _Renderer:
         return obs[:, CENTRE, : self._agent].astype(self._dtype)
 
     def _make_patches(self) -> np.ndarray:
-        """Return the changing channels of a cell, (512 + 32 * 256, C - first), one row per patch, see `_ON_COUNTER`."""
+        """Return the changing channels of a cell, (512 + 32 * 256, C - first), by content, see `_ON_COUNTER`."""
         layout, where = self._layout, self._columns
         every_byte = np.arange(256, dtype=np.uint8)
         record = np.zeros((2 + _TIMERS, 256, record_size(layout)), np.uint8)
@@ -182,7 +182,7 @@ class _Renderer:
         patches = np.zeros((*record.shape[:2], self._shape[-1] - self._first), self._dtype)
         kinds = (slice(0, 1), layout.counters), (slice(1, 2), layout.buttons), (slice(2, None), layout.pots)
         for rows, cells in kinds:
-            # The patches of a kind of cell are equal wherever it is seen from, so one view is enough.
+            # A cell looks the same from wherever the ego sees it, so one view of each kind of cell is enough.
             views = [(ego, cell) for cell in cells for ego in self._floor if self._in_window[ego, cell] != NOWHERE]
             if views:
                 record[rows, :, 0] = views[0][0]
@@ -203,5 +203,5 @@ def _index_of(values: np.ndarray) -> np.ndarray:
     return lookup
 
 
-# Up to 4 MB per renderer; a batch can mix many of a release's hundreds of layouts.
+# A renderer takes up to 4 MB; a release can have hundreds of layouts.
 _renderer = lru_cache(maxsize=256)(_Renderer)

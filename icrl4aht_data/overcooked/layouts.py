@@ -43,7 +43,7 @@ from icrl4aht_data.utils.options import convert_option
 from icrl4aht_data.utils.plugins import Plugins
 
 _LETTERS = {"W": WALL, "X": GOAL, "P": POT, "R": INDICATOR, "L": BUTTON, "B": PLATES, " ": EMPTY, "A": EMPTY}
-_type_hints = cache(get_type_hints)  # resolving them takes as long as all checks of a layout
+_type_hints = cache(get_type_hints)  # cached, since resolving type hints takes as long as all checks of a layout
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ class Layout:
 
     @cached_property
     def ingredients(self) -> tuple[int, ...]:
-        """Ids of the ingredients that have a pile, ascending; bits 2 + 2k, 3 + 2k of an item count the k-th."""
+        """Ids of the ingredients that have a pile, ascending; bits 2 + 2k and 3 + 2k of an item byte count the k-th."""
         return tuple(sorted({int(c) for c in "".join(self.rows) if c in digits}))
 
     @cached_property
@@ -166,7 +166,7 @@ class Layout:
 
     @cached_property
     def rooms(self) -> tuple[np.ndarray, np.ndarray]:
-        """Floor cells that the ego can reach, and floor cells that the teammate can reach; uint8, ascending."""
+        """Pair of uint8 arrays: floor cells that the ego can reach, and that the teammate can reach; ascending."""
         first, second = (self._reachable(cell) for cell in self.agent_cells)
         return first, second
 
@@ -202,7 +202,7 @@ class Layout:
         here = np.arange(self.cells, dtype=np.uint8)[:, None]
         target = self.ahead[:, FACING_OF]
         moved = np.where(self.walkable[:, None] & self.walkable[target], target, here)
-        return np.concatenate([moved, here, here], axis=1)  # the actions stay and interact do not move
+        return np.concatenate([moved, here, here], axis=1)  # `stay` and `interact` do not move the agent
 
     @cached_property
     def pots(self) -> tuple[int, ...]:

@@ -80,7 +80,7 @@ def _expand(tables: Tables, agents: Array, cells: Array, canonical: bool) -> Arr
 
 
 def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
-    """Return two packed words uint32 (B, 25) per visible cell: of the agents on the cell, and of the cell itself."""
+    """Return two packed words uint32 (B, 25) per visible cell: one for the agents on it, one for the cell itself."""
     xp = record.__array_namespace__()
     state = unpack(tables, record)
     me, other = state.positions[..., agent], state.positions[..., 1 - agent]
@@ -91,7 +91,7 @@ def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
 
     bodies = 1 | xp.astype(1 << (xp.astype(state.facings, xp.uint32) + 1), xp.uint32)
     bodies = bodies | xp.astype(state.hands, xp.uint32) << 5
-    # The agents are in different cells, and no agent has the number NOWHERE of cells outside the map.
+    # At most one agent is on a cell, and no agent is on NOWHERE, the number of all cells outside the map.
     cell, none = view >> CELL_BIT, xp.zeros_like(cells)
     agents = xp.where(cell == me[..., None], bodies[..., agent, None], none) | xp.where(
         cell == other[..., None], bodies[..., 1 - agent, None] << AGENT_BITS, none
@@ -100,7 +100,7 @@ def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
 
 
 def _packed_changing_cells(xp, state: State) -> Array:
-    """Return packed words uint32 (B, 3 + P + L + K) of changing cells: 0, indicator, goal, pots, buttons, counters."""
+    """Return packed words uint32 (B, 3 + P + L + K) of a fixed cell (0), indicator, goal, pots, buttons, counters."""
     # The shift by 2 removes the plate and cooked flags, which a recipe never has.
     recipe = xp.astype(state.recipe >> 2, xp.uint32)[..., None] << RECIPE_BIT
     delivered = xp.astype(state.delivered, xp.uint32)[..., None] << DELIVERY_BIT

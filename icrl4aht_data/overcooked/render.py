@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 _ENLARGE = 4
-_GIF_COLOURS = 127  # a 128th palette entry is needed for transparent pixels, which do not change between frames
+_GIF_COLOURS = 127  # the 128th palette entry is for transparent pixels, which keep the colour of the previous frame
 
 
 def draw_frame(
@@ -94,7 +94,7 @@ def encode_episode(
         caption = f"step {step}" if math.isnan(reward) else f"step {step}   return {earned:g}"
         frames.append(_draw_state(layout, record, cell, caption, True))
         earned += reward
-    colours, dither = _shared_palette(frames), _pillow("Image").Dither.NONE
+    colours, dither = _shared_palette(frames), _import_pillow("Image").Dither.NONE
     first, *rest = (frame.quantize(palette=colours, dither=dither) for frame in frames)
     other = {"duration": round(1000 / fps), "loop": 0}
     palette = bytes(colours.getpalette() or [])  # Pillow writes an explicit palette once instead of once per frame
@@ -103,7 +103,7 @@ def encode_episode(
     return content.getvalue()
 
 
-def _pillow(module: str) -> Any:
+def _import_pillow(module: str) -> Any:
     return import_optional(f"PIL.{module}", "drawing")
 
 
@@ -129,24 +129,24 @@ def _shared_palette(frames: list[Image.Image]) -> Image.Image:
     most = Counter()
     for frame in frames:
         most |= Counter({colour: count for count, colour in frame.getcolors(frame.width * frame.height) or []})
-    palette = _pillow("Image").new("P", (1, 1))
+    palette = _import_pillow("Image").new("P", (1, 1))
     palette.putpalette([value for colour, _ in most.most_common(_GIF_COLOURS) for value in colour])
     return palette
 
 
 @lru_cache(maxsize=32)
-def _font(pixels: int) -> Any:
-    return _pillow("ImageFont").load_default(pixels)
+def _load_font(pixels: int) -> Any:
+    return _import_pillow("ImageFont").load_default(pixels)
 
 
 class _Picture:
-    """Draws the shapes of a `Canvas` in an enlarged Pillow image; each method draws the kind of shape that it names."""
+    """Draws the shapes of a `Canvas` in an enlarged Pillow image; each method draws one kind of shape."""
 
     def __init__(self, width: float, height: float, cell: int) -> None:
         self.unit = cell * _ENLARGE
         size = round(width * cell) * _ENLARGE, round(height * cell) * _ENLARGE
-        self.image = _pillow("Image").new("RGB", size, PAPER)
-        self.pen = _pillow("ImageDraw").Draw(self.image)
+        self.image = _import_pillow("Image").new("RGB", size, PAPER)
+        self.pen = _import_pillow("ImageDraw").Draw(self.image)
 
     def box(self, x: float, y: float, width: float, height: float, fill: tuple, radius: float) -> None:
         left, top, wide, high = (self.unit * v for v in (x - width / 2, y - height / 2, width, height))
@@ -168,8 +168,8 @@ class _Picture:
 
     def text(self, x: float, y: float, words: str, size: float, fill: tuple, anchor: str, max_width: float) -> None:
         """Draw text, shrunk if it is wider than `max_width`."""
-        width = self.pen.textlength(words, _font(round(self.unit * size))) / self.unit
-        font = _font(max(1, int(self.unit * size * max_width / max(max_width, width))))
+        width = self.pen.textlength(words, _load_font(round(self.unit * size))) / self.unit
+        font = _load_font(max(1, int(self.unit * size * max_width / max(max_width, width))))
         self.pen.text((self.unit * x, self.unit * y), words, fill, font, anchor, stroke_width=round(font.size / 40))
 
 

@@ -138,10 +138,10 @@ def _interact(
     faced = look_up(tables.faced.reshape(-1), pose)
     kind, pile, number = faced & 255, xp.astype(faced >> 8 & 255, xp.uint8), faced >> 16
     facing_pot, facing_counter = acting & (kind == POT), acting & (kind == WALL)
-    # One-hot masks over the few cells that hold items read and write in NumPy and JAX without a scatter.
-    at_pot = (number[..., None] == _range(xp, len(tables.pots))) & facing_pot[..., None]
-    at_counter = (number[..., None] == _range(xp, len(tables.counters))) & facing_counter[..., None]
-    at_button = (number[..., None] == _range(xp, len(tables.buttons))) & (acting & (kind == BUTTON))[..., None]
+    # Items are read and written by one-hot masks over the few cells with items, without a scatter.
+    at_pot = (number[..., None] == _indices(xp, len(tables.pots))) & facing_pot[..., None]
+    at_counter = (number[..., None] == _indices(xp, len(tables.counters))) & facing_counter[..., None]
+    at_button = (number[..., None] == _indices(xp, len(tables.buttons))) & (acting & (kind == BUTTON))[..., None]
     content = _read(xp, at_pot, state.pot_items) | _read(xp, at_counter, state.counters)
     timer = _read(xp, at_pot, state.pot_timers)
 
@@ -195,7 +195,7 @@ def _interact(
     return state, sum(xp.astype(happened, xp.uint8) * np.uint8(bit) for bit, happened in bits.items())
 
 
-def _range(xp, n: int) -> Array:
+def _indices(xp, n: int) -> Array:
     return xp.arange(n, dtype=xp.int32)
 
 

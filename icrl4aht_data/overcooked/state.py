@@ -1,4 +1,4 @@
-"""State records: all inputs of the rules and the observations in S bytes (uint8); S is 14 to 36, by layout.
+"""State records: all inputs of the rules and the observations in S bytes (uint8); S depends on the layout, 14 to 36.
 
 Columns of a record, in order (columns of the agents: first the ego, then the teammate):
 
@@ -63,7 +63,7 @@ class State(NamedTuple):
 
 def columns(layout: Layout | Tables) -> State:
     """Return the columns of each field in a layout's records: an int for `recipe` and `delivered`, slices otherwise."""
-    pots, buttons, counters = _counts(layout)
+    pots, buttons, counters = _count_changing_cells(layout)
     ends = np.cumsum([8, pots, pots, buttons, counters]).tolist()
     rest = [slice(a, b) for a, b in pairwise(ends)]
     return State(slice(0, 2), slice(2, 4), slice(4, 6), 6, 7, *rest)
@@ -71,11 +71,11 @@ def columns(layout: Layout | Tables) -> State:
 
 def record_size(*layouts: Layout | Tables) -> int:
     """Return the size in bytes of a state record that is padded to fit each of the given layouts or tables."""
-    pots, buttons, counters = np.max([_counts(layout) for layout in layouts], axis=0).tolist()
+    pots, buttons, counters = np.max([_count_changing_cells(layout) for layout in layouts], axis=0).tolist()
     return 8 + 2 * pots + buttons + counters
 
 
-def _counts(layout: Layout | Tables) -> tuple[int, int, int]:
+def _count_changing_cells(layout: Layout | Tables) -> tuple[int, int, int]:
     pots, buttons, counters = (np.shape(cells)[-1] for cells in (layout.pots, layout.buttons, layout.counters))
     return pots, buttons, counters
 

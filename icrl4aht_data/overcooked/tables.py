@@ -49,7 +49,7 @@ _KINDS = {"wall": WALL, "goal": GOAL, "pot": POT, "recipe_indicator": INDICATOR,
 
 
 class ChannelBits(NamedTuple):
-    """Bits of a visible cell's two packed words that each observation channel shows.
+    """Place of each observation channel in the two packed words of a visible cell.
 
     Attributes:
         shift: uint32 (C,), lowest bit of each channel in the packed word.
@@ -169,7 +169,7 @@ def stack_padded(parts: Sequence[Any], padding: Mapping[str, int]) -> Any:
             repeated recipe changes no decision of a scripted agent.
     """
 
-    def stacked(name: str, values: Sequence[Any]) -> Any:
+    def stack_field(name: str, values: Sequence[Any]) -> Any:
         if isinstance(values[0], tuple):
             return stack_padded(values, padding)
         shape = np.max([value.shape for value in values], axis=0).astype(int)
@@ -181,7 +181,7 @@ def stack_padded(parts: Sequence[Any], padding: Mapping[str, int]) -> Any:
         return found
 
     fields = zip(type(parts[0])._fields, zip(*parts, strict=True), strict=True)
-    return type(parts[0])(*(stacked(name, values) for name, values in fields))
+    return type(parts[0])(*(stack_field(name, values) for name, values in fields))
 
 
 def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = None) -> Tables:
@@ -216,7 +216,7 @@ def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = N
         ahead=ahead,
         faced=kinds[ahead] | layout.piles[ahead].astype(np.int32) << 8 | number[ahead].astype(np.int32) << 16,
         moves=layout.moves,
-        view=_view(layout, number.astype(int), pots, buttons),
+        view=_make_view(layout, number.astype(int), pots, buttons),
         own=_channel_bits(layout, layout.ingredient_types, layout.indicates_delivery),
         canonical=_channel_bits(layout, canonical, True),
         pots=np.array(layout.pots, np.uint8),
@@ -264,7 +264,7 @@ def _shortest_paths(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     return distance.astype(np.uint8), np.where((distance > 0) & (distance < far), step, STAY).astype(np.uint8)
 
 
-def _view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.ndarray:
+def _make_view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.ndarray:
     """Return the table `Tables.view`; `number`, int (cells,), is `Tables.number`."""
     words = {INDICATOR: 1, GOAL: 2, POT: 3 + number, BUTTON: 3 + pots + number}
     changing = np.select([layout.kinds == kind for kind in words], list(words.values()), 0)
@@ -275,7 +275,7 @@ def _view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.nda
     for bit, ingredient in enumerate(layout.ingredients):
         pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
         fixed |= pile.astype(np.int32) << (_PILES - FIXED_BIT + bit)
-    # Cells outside the map have changing word 0, which is always zero, no fixed bits, and a number that no cell has.
+    # Cells outside the map have no fixed bits, word 0 of the changing words, which is always zero, and number NOWHERE.
     packed = changing | fixed << 8 | np.arange(layout.cells) << CELL_BIT
     return np.where(layout.window >= 0, packed[layout.window], NOWHERE << CELL_BIT).astype(np.int32)
 
@@ -289,36 +289,36 @@ def packed_channels(types: int, delivery: bool, layout: Layout | None = None) ->
         layout: the layout; None if only the names of the channels are needed.
 
     Returns:
-        Channel name -> (lowest bit, bits), in the order of the channels; no bits for channels that are always 0.
+        (lowest bit, bits) by channel name, in the order of the channels; bits 0 for channels that are always 0.
     """
     order = {ingredient: number for number, ingredient in enumerate(layout.ingredients if layout else ())}
 
-    def by_type(name: str, first: int, width: int, mask: int) -> dict[str, tuple[int, int]]:
+    def ingredient_channels(name: str, first: int, width: int, mask: int) -> dict[str, tuple[int, int]]:
         return {f"{name}_{i}": (first + width * order[i], mask) if i in order else (0, 0) for i in range(types)}
 
-    def item(owner: str, first: int) -> dict[str, tuple[int, int]]:
+    def item_channels(owner: str, first: int) -> dict[str, tuple[int, int]]:
         flags = {f"{owner}_plate": (first, 1), f"{owner}_cooked": (first + 1, 1)}
-        return flags | by_type(f"{owner}_ingredient", first + 2, 2, 3)
+        return flags | ingredient_channels(f"{owner}_ingredient", first + 2, 2, 3)
 
-    def agent(owner: str, first: int) -> dict[str, tuple[int, int]]:
+    def agent_channels(owner: str, first: int) -> dict[str, tuple[int, int]]:
         facings = {f"{owner}_facing_{facing}": (first + 1 + number, 1) for number, facing in enumerate(FACINGS)}
-        return {f"{owner}_position": (first, 1)} | facings | item(owner, first + 5)
+        return {f"{owner}_position": (first, 1)} | facings | item_channels(owner, first + 5)
 
     return {
-        **agent("self", 0),
-        **agent("other", AGENT_BITS),
+        **agent_channels("self", 0),
+        **agent_channels("other", AGENT_BITS),
         **{name: (FIXED_BIT + bit, 1) for bit, name in enumerate(_KINDS)},
-        **by_type("pile", _PILES, 1, 1),
-        **item("item", 0),
+        **ingredient_channels("pile", _PILES, 1, 1),
+        **item_channels("item", 0),
         **dict.fromkeys(("recipe_plate", "recipe_cooked"), (0, 0)),
-        **by_type("recipe_ingredient", RECIPE_BIT, 2, 3),
+        **ingredient_channels("recipe_ingredient", RECIPE_BIT, 2, 3),
         "pot_timer": (TIMER_BIT, 31),
         **({"delivery": (DELIVERY_BIT, int(layout is not None and layout.indicates_delivery))} if delivery else {}),
     }
 
 
 def _channel_bits(layout: Layout, types: int, delivery: bool) -> ChannelBits:
-    """Return the bits of the channels for `types` ingredient types, with or without delivery; empty for 0 types."""
+    """Return the bits of the channels for `types` ingredient types and `delivery`; empty arrays if `types` is 0."""
     channels = packed_channels(types, delivery, layout) if types else {}
     shift, mask = np.array(list(channels.values()), np.uint32).reshape(-1, 2).T
     return ChannelBits(shift, mask, np.array([name.startswith(("self", "other")) for name in channels], bool))

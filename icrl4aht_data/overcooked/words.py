@@ -120,7 +120,7 @@ class CellWords:
             number = xp.reshape(layout_number, (*layout_number.shape, *[1] * (len(batch) - layout_number.ndim)))
             number = xp.astype(xp.broadcast_to(number, batch), xp.int32)
 
-        def at(table: np.ndarray, *indices: Array) -> Array:
+        def of_layout(table: np.ndarray, *indices: Array) -> Array:
             """Return `table[number, *indices]`, where `number` is the number of each record's layout."""
             flat = number
             for index, size in zip(indices, table.shape[1:], strict=False):
@@ -128,25 +128,25 @@ class CellWords:
             rest = table.shape[1 + len(indices) :]
             return look_up(table.reshape(-1, *rest), flat) if several or indices else xp.asarray(table[0])
 
-        def pairs(byte: Array, second: Array) -> Array:
+        def pair_number(byte: Array, second: Array) -> Array:
             return xp.astype(second & (_SECONDS - 1), xp.int32) << 8 | xp.astype(byte, xp.int32)
 
         zeros = xp.zeros((*batch, self._size + 1 - record.shape[-1]), dtype=xp.uint8)
         padded = xp.concat([record, zeros], axis=-1)
         if several:
-            byte, second = (xp.take_along_axis(padded, at(c), axis=-1) for c in (self._byte, self._second))
+            byte, second = (xp.take_along_axis(padded, of_layout(c), axis=-1) for c in (self._byte, self._second))
         else:
             byte, second = padded[..., self._byte[0]], padded[..., self._second[0]]
-        first = (number[..., None] if several else 0) * self._words[0].size + at(self._kind) * _PAIRS
-        by_slot = look_up(self._words.reshape(-1), first + pairs(byte, second))
+        first = (number[..., None] if several else 0) * self._words[0].size + of_layout(self._kind) * _PAIRS
+        by_slot = look_up(self._words.reshape(-1), first + pair_number(byte, second))
 
         me, other = record[..., agent], record[..., 1 - agent]
-        slots = xp.astype(at(self._slot, me), xp.int32)
-        words = xp.take_along_axis(by_slot, slots, axis=-1) + at(self._fixed, me)
+        slots = xp.astype(of_layout(self._slot, me), xp.int32)
+        words = xp.take_along_axis(by_slot, slots, axis=-1) + of_layout(self._fixed, me)
         facings, hands = record[..., 2:4], record[..., 4:6]
-        own = at(self._words[:, _SELF], pairs(hands[..., agent], facings[..., agent]))
-        others = at(self._words[:, _OTHER], pairs(hands[..., 1 - agent], facings[..., 1 - agent]))
-        position, relative = xp.arange(VISIBLE, dtype=xp.uint8), at(self._window_position, me, other)
+        own = of_layout(self._words[:, _SELF], pair_number(hands[..., agent], facings[..., agent]))
+        others = of_layout(self._words[:, _OTHER], pair_number(hands[..., 1 - agent], facings[..., 1 - agent]))
+        position, relative = xp.arange(VISIBLE, dtype=xp.uint8), of_layout(self._window_position, me, other)
         words = xp.where(position == relative[..., None], others[..., None], words)
         return xp.astype(xp.where(position == CENTRE, own[..., None], words), xp.int32)
 
@@ -208,7 +208,7 @@ def _fixed_cells(layout: Layout, canonical: bool) -> np.ndarray:
 
 
 def _contents(layout: Layout, canonical: bool) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Return the possible pairs of numbers, int (n,), and their channels, uint8 (n, C), by kind of content."""
+    """Return by kind of content: the possible pairs as one number each, int (n,), and their channels, uint8 (n, C)."""
     item = np.arange(256)
     possible, count = possible_items(layout), ingredient_count(item)
     carried = np.flatnonzero(possible & ((item & PLATE > 0) | (count <= 1)))

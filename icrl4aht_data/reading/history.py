@@ -111,7 +111,7 @@ class History(FieldArrays):
         return self._shard.read(self.entry.history_id, field, start, stop)
 
     def rows(self, name: str, start: int, stop: int) -> np.ndarray:
-        """Return rows start..stop of a field as `read` does; "obs" has the form of the options `obs` and `channels`."""
+        """Return the same rows as `read`, but "obs" in the form that the options `obs` and `channels` choose."""
         if name in self._arrays:
             return self._arrays[name][start:stop]
         if name != "obs":

@@ -174,8 +174,8 @@ class Selection:
             name: the field; or "labels", which counts histories with expert and with oracle actions.
 
         Returns:
-            Value -> number of histories, above 0; values in order of first appearance in the release. Histories without
-            a value are not counted.
+            Number of histories by value, for values with histories, in order of first appearance in the release.
+            Histories without a value are not counted.
 
         Raises:
             UnknownNameError: if the index has no such text field.
@@ -234,7 +234,7 @@ class Selection:
         if name == "obs_shape":
             return np.array([layout.obs_shape for layout in self.layouts])[self.layout_numbers]
         if ENTRY_HINTS[name] in TEXTS or name in ENCODED:
-            # A release without histories has no values, and NumPy would make an array of floats of an empty list.
+            # A release without histories has no values, and NumPy would turn an empty list into an array of floats.
             return np.array(self.index.values(name) or [""])[self.column_codes(name)]
         return self.index.entries.column(name)[self.ids]
 
@@ -266,7 +266,7 @@ class Selection:
     def layout_numbers(self) -> np.ndarray:
         """Index of each history's layout in `layouts`, int32 (H,)."""
         numbers = {layout.name: number for number, layout in enumerate(self.layouts)}
-        # A table from the release's codes to the selection's numbers takes one lookup per history, and no comparison.
+        # The table maps layout codes of the release to layout numbers of the selection.
         table = np.array([numbers.get(name, 0) for name in self.index.values("layout")], np.int32)
         return table[self.column_codes("layout")]
 
@@ -295,7 +295,7 @@ class Selection:
     @property
     def storage(self) -> HistorySource:
         """Source of the selection's rows in cache mode `cache`; `ram` and `mmap` decode all rows on first access."""
-        if self._source is None:  # no lock, since a fork could leave it locked; parallel first accesses both decode
+        if self._source is None:  # no lock, which a fork could leave locked; parallel accesses may decode twice
             self._source = open_source(self.cache.cache, self.entries, self._shards, self.threads)
         return self._source
 
@@ -317,7 +317,7 @@ class Selection:
             UnknownNameError, OptionError: for impossible options, such as obs="state" for a release of observations.
         """
         changed: dict[str, Any] = {"obs": obs, "cache": cache, "threads": threads, "channels": channels}
-        # `replace` creates new options, which check themselves.
+        # `replace` makes new options, which `__post_init__` checks.
         options = replace(self.options, **{name: value for name, value in changed.items() if value is not None})
         return type(self)(self._shards, options, self.ids)
 
@@ -358,8 +358,8 @@ class Selection:
             least, returns = check_number("min_expert_return", min_expert_return), found.column("expert_return")
             if np.isnan(returns).any():
                 raise NotStoredError(
-                    f"min_expert_return: {self.origin} does not have the returns of the policies behind the labels of "
-                    f"{np.isnan(returns).sum()} of {len(found)} histories; leave these histories out by "
+                    f"min_expert_return: {self.origin}: the expert return of {np.isnan(returns).sum()} of {len(found)} "
+                    f"histories is unknown; leave these histories out by "
                     f'ds.select(~np.isnan(ds.column("expert_return")))'
                 )
             found = found._select_if(

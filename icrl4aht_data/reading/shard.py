@@ -100,7 +100,7 @@ class Shard:
         self.datasets = [(entry, field) for entry in entries for field in entry.stored_fields(self.kind)]
         self._cache = cache
         self._elements = {field.name: field.element(self.layout, self.kind) for field in FIELDS.values()}
-        self._first: dict[tuple[int, str], int] = {}  # (history id, field) -> row of its first chunk in the table
+        self._first: dict[tuple[int, str], int] = {}  # row of the first chunk in the table by (history id, field)
         location.fetch([chunk_table_name(name), name])
         self.table = read_table(location.file(chunk_table_name(name)))
         self._check_table()
@@ -120,8 +120,8 @@ class Shard:
         for (entry, field), first, rows in zip(self.datasets, firsts, sums, strict=True):
             self._first[entry.history_id, field.name] = first
             if rows != entry.rows(field):
-                where = f"history {entry.history_id}: the index says {entry.rows(field)} rows of {field.name}"
-                raise self._mismatch(f"{where}, the chunk table says {rows}")
+                where = f"history {entry.history_id}: the index implies {entry.rows(field)} rows of {field.name}"
+                raise self._mismatch(f"{where}, the chunk table has {rows}")
             sizes.append(self._chunk_rows(entry.history_id, field) * self._elements[field.name].itemsize)
         raw, stored = np.repeat(sizes, chunks), table["size"][:total].astype(np.int64)
         wrong = np.flatnonzero((stored > raw + raw // 1000 + 64) | (raw > DEFLATE_RATIO * stored))

@@ -54,7 +54,7 @@ class ADBatch(NamedTuple, Generic[A]):
     attention_mask: A
     prev_teammate_actions: A | None = None
     layouts: A | None = None
-    is_first: A = cast(Any, None)  # the default is required but never used
+    is_first: A = cast(Any, None)  # Python requires a default here; it is never used
     families: A | None = None
 
     describe = describe_batch
@@ -187,7 +187,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         return position, rows[:, 1], rows[:, 1:], rows[:, :-1], valid
 
     def batch(self, i: int, out: ADBatch[np.ndarray] | None = None) -> ADBatch[np.ndarray]:
-        batch = self._buffer(out)  # before drawing, so that a batch that is too large is refused at once
+        batch = self._buffer(out)  # first, so that a batch that is too large raises an error at once
         position, starts, rows, previous, valid = self._draw(i)
         if self.every > 1:
             previous = np.maximum(previous, 0)  # sources accept -1 as first row of a window, not as a single row
@@ -218,7 +218,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         batch.attention_mask[...] = True
         if valid.min() < self.length:
             np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)
-            # Padding has rows of later episodes, or observations rendered from zeros, which are replaced by zeros.
+            # Padding is set to zero: rows of later episodes were read, or observations were rendered from zeros.
             for array in (batch.obs, *(read.out for read in reads[1:])):
                 array[~batch.attention_mask] = 0
         return batch

@@ -93,7 +93,10 @@ class Sampler(Generic[B, D, T]):
         self.dataset, self.layouts, self._observer = dataset, dataset.layouts, Observer(dataset)
         # Checked here, since a training run may take the first batch only after an hour of compilation.
         if teammate_actions and not dataset.column("has_teammate_actions").all():
-            raise LabelsMissingError("teammate_actions = True: some histories have no teammate actions")
+            raise LabelsMissingError(
+                "teammate_actions = True: some histories have no teammate actions; leave these histories out by "
+                'ds.select(ds.column("has_teammate_actions"))'
+            )
         self.teammate_actions = teammate_actions
         self._draws = HistoryDraws(dataset, weights, episodes, curriculum)
 
@@ -182,7 +185,7 @@ class Sampler(Generic[B, D, T]):
         return {"layouts": ArraySpec("int32", (self.local_size,))} if several else {}
 
     def _buffer(self, out: B | None) -> B:
-        """Return `out` after checking its arrays, or a new batch if it is None; see `empty`."""
+        """Return `out` after checking its arrays, or a new batch if `out` is None; see `empty`."""
         if out is None:
             return self.empty()
         if not isinstance(out, self.batch_type):
@@ -207,7 +210,7 @@ def warn_of_mixed_splits(dataset: Selection) -> None:
             f'the teammates that it is tested with. Choose the training histories: load_icrl4aht(split="train"), or '
             f'ds.filter(split="train")',
             MixedSplitsWarning,
-            stacklevel=3,  # the line that called Dataset.ad or Dataset.dpt
+            stacklevel=3,  # shows the line that called Dataset.ad or Dataset.dpt
         )
 
 
@@ -229,7 +232,7 @@ def check_labels(dataset: Selection, labels: Labels) -> None:
     raise LabelsMissingError(
         f"labels = {labels}: {len(missing)} of {len(dataset)} histories have no {labels} actions, those of "
         f"{counted_noun(len(np.unique(tasks)), 'task')} (first: history {dataset.ids[missing[0]]} of task {tasks[0]}); "
-        f"{counts}: use labels that all have, or ds.select(ds.has_labels({labels!r}))"
+        f"{counts}: use labels that all histories have, or ds.select(ds.has_labels({labels!r}))"
     )
 
 
@@ -259,7 +262,7 @@ def _warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
         f"the {labels} actions of {len(weak)} of {len(codes)} tasks come from {player} less than half of what their "
         f"histories earn at the end: {named}. A model would learn to play worse than its contexts: {advice}",
         WeakLabelsWarning,
-        stacklevel=5,  # the line that called Dataset.ad or Dataset.dpt
+        stacklevel=5,  # shows the line that called Dataset.ad or Dataset.dpt
     )
 
 
@@ -269,7 +272,7 @@ def describe_batch(self: Any) -> str:
 
 
 def _array_lines(arrays: Mapping[str, Any]) -> str:
-    """Return one line per entry: name, dtype and shape of an array, or the text of another object (a sharding)."""
+    """Return one line per array with its name, dtype and shape; other objects, such as shardings, are shown as text."""
     width = max(map(len, arrays), default=0)
     shown = {
         name: f"{str(array.dtype).removeprefix('torch.'):<8} {tuple(array.shape)}" if hasattr(array, "dtype") else array

@@ -113,7 +113,9 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         ranges = (map(self._count_transitions, self._draws.steps(i)) for i in (0, 2**62))
         shortest = min(int((high - low).min()) for low, high in ranges)
         if (self.length if order == "contiguous" else 1) > shortest:
-            raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; give fewer")
+            raise OptionError(
+                f"context = {context}: the shortest history has {shortest} transitions; choose a smaller context"
+            )
         check_labels(dataset, labels)
         self.order, self.labels = order, labels
 
@@ -138,7 +140,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         }
 
     def batch(self, i: int, out: DPTBatch[np.ndarray] | None = None) -> DPTBatch[np.ndarray]:
-        batch = self._buffer(out)  # before drawing, so that a batch that is too large is refused at once
+        batch = self._buffer(out)  # first, so that a batch that is too large raises an error at once
         query, query_steps, context, steps = self._draw(i)
 
         observer, kept_steps = self._observer, self._draws.kept_steps
@@ -148,7 +150,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
             # Windows given by their first row are copied as blocks. The row after the end of a history has zeros.
             rows, next_rows = steps[:, 0], steps[:, 0] + 1
         else:
-            # Single rows must exist, so the last row of a history is read in place of the next, and replaced below.
+            # Single rows after a history's end cannot be read: its last row is read instead, and replaced below.
             rows, next_rows = steps, np.minimum(steps + 1, self._draws.lengths[context][:, None] - 1)
         # Requests need the axis Q, which arrays with one query do not have.
         queries, record = query_steps.shape, records.shape[2:]
@@ -162,7 +164,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         ]
         if batch.context_teammate_actions is not None:
             reads.append(ReadRequest("teammate_actions", context, rows, batch.context_teammate_actions))
-        # After an episode's last step comes the episode's end state, not the first state of the next episode.
+        # The next observation of an episode's last step shows the end state, not the first state of the next episode.
         episodes = steps // kept_steps
         ends = np.nonzero((steps == episodes * kept_steps + kept_steps - 1) & self.dataset.has_states)
         end_records = np.empty((len(ends[0]), 1, *record), next_records.dtype)
@@ -213,7 +215,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions in the selection sorted by task, int64 (H,), and where each task starts and ends in this order."""
         _, first, task = np.unique(self.dataset.column_codes("task_id"), return_index=True, return_inverse=True)
-        task = np.argsort(np.argsort(first))[task]  # renumbered by first appearance
+        task = np.argsort(np.argsort(first))[task]  # tasks are renumbered in order of first appearance
         sizes = np.bincount(task)
         return np.argsort(task, kind="stable"), np.cumsum(sizes) - sizes, np.cumsum(sizes)
 

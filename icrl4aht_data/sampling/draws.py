@@ -105,7 +105,7 @@ def weighted_choice(random: np.ndarray, weights: np.ndarray | None, first: Any, 
     edges = np.concatenate([[0.0], np.cumsum(weights, dtype=np.float64)])
     low, high = edges[first], edges[stop]
     position = np.searchsorted(edges, low + random.astype(np.float64) / 2**32 * (high - low), side="right") - 1
-    return np.clip(position, first, np.asarray(stop) - 1).astype(np.int64)  # rounding may give `stop`
+    return np.clip(position, first, np.asarray(stop) - 1).astype(np.int64)  # rounding may give `stop` itself
 
 
 class HistoryDraws:
@@ -141,11 +141,11 @@ class HistoryDraws:
         if self.curriculum is not None:
             low, high = self.curriculum.part(i)
             count = stop - first
-            # The part has complete episodes, at least one. Without 1e-9, rounding could make 0.3 * 10 episodes 4.
+            # The part has one or more complete episodes. Without 1e-9, rounding errors could turn 0.3 * 10 into 4.
             low = np.minimum(np.floor(low * count + 1e-9).astype(np.int64), count - 1)
             high = np.maximum(np.ceil(high * count - 1e-9).astype(np.int64), low + 1)
             first, stop = first + low, first + high
-        # A range up to the last episode includes the steps of an unfinished one.
+        # A range up to the last episode includes the last episode's steps even if the episode is unfinished.
         return first * self.kept_steps, np.where(stop == self._counts, self.lengths, stop * self.kept_steps)
 
     def history_weights(self, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
@@ -190,7 +190,7 @@ def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[n
     """Return the first episode and the end (exclusive) of a range in histories of `counts` episodes, int64 (H,) each.
 
     Raises:
-        OptionError: if the range is malformed, or some history has no episode in it.
+        OptionError: if the range is malformed, or some history has no episode in the range.
     """
     if episodes is None:
         return np.zeros_like(counts), counts

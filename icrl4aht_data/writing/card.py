@@ -108,7 +108,12 @@ def render_card(content: Mapping[str, Any]) -> str:
     environment = Environment(
         trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined, keep_trailing_newline=True
     )
-    environment.filters |= {"table": markdown_table, "counted": counted_noun, "span": _span, "proof_table": proof_table}
+    environment.filters |= {
+        "table": markdown_table,
+        "counted": counted_noun,
+        "span": _range_text,
+        "proof_table": proof_table,
+    }
     return environment.from_string(card_file("dataset.md").read_text(encoding="utf-8")).render(content)
 
 
@@ -188,7 +193,7 @@ def card_facts(root: Path) -> dict[str, Any]:
         },
         "swapped": sum(entry.teammate_of_episode is not None for entry in entries),
         "example": {"split": first.split, "layout": first.layout, "length": length},
-        "layouts": _layouts(info, titles, matters),
+        "layouts": _layout_rows(info, titles, matters),
         "learning": learning,
         "curves": _curve_rows(learning, sources),
         "teammates": teammates,
@@ -215,7 +220,7 @@ def _mean(values: Iterable[float]) -> float:
     return float(np.mean(list(values)))
 
 
-def _span(values: Iterable[float]) -> str:
+def _range_text(values: Iterable[float]) -> str:
     """Return the range of values as text, such as "3" or "3 to 5"; an empty string for no values."""
     found = list(values)
     ends = [f"{end:z,.0f}" for end in (min(found), max(found))] if found else []
@@ -236,7 +241,7 @@ def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str,
 
 
 def _learning_rows(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return a row on the rise of returns for each layout title, source and split, in this order."""
+    """Return a row with first and last returns for each layout title, source and split, sorted in this order."""
     names = ("layout", "source", "split")
     order = [*titles, *SOURCES, *(task.first.source for task in tasks), *SPLITS]  # sources not in SOURCES come last
     ordered = sorted(tasks, key=lambda task: [order.index(getattr(task.first, name)) for name in names])
@@ -306,7 +311,9 @@ def _behaviour_counts(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     return {"behaviours": counts, "shared_behaviours": len({*found.get("train", ())} & {*found.get("validation", ())})}
 
 
-def _layouts(info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str, Sequence[bool]]) -> list[list[str]]:
+def _layout_rows(
+    info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str, Sequence[bool]]
+) -> list[list[str]]:
     """Return the rows of the card's table of layouts, one for each layout title.
 
     Args:
@@ -323,7 +330,7 @@ def _layouts(info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str,
         rows.append(
             [
                 title if title in own else f"{title} ({len(own)} generated layouts)",
-                _span(one.obs_shape[-1] for one in layouts),
+                _range_text(one.obs_shape[-1] for one in layouts),
                 f"{sum(histories):,}",
                 f"{sum(found.transitions for found in own.values()):,}",
                 f"{final:z.1f}",
@@ -392,7 +399,7 @@ def _kind_rows(tasks: Iterable[_TaskFacts], layouts: Iterable[str]) -> list[list
     found = defaultdict[tuple[str, str, bool], set[tuple[str, str]]](set)
     for task in (one.task for one in tasks if one.task is not None):
         name = task.layout.name
-        key = name, json.dumps(task.teammate, sort_keys=True)  # `teammate_key` would also compare recipes
+        key = name, json.dumps(task.teammate, sort_keys=True)  # unlike `teammate_key`, without the recipes
         found[_teammate_kind(task), task.split, name in TESTED_ON].add(key)
     named = [*HEURISTIC_KINDS.values(), _MIXED, _WATCHING, *(f"learned by {name}" for name in ALGORITHMS)]
     if not found:
@@ -417,7 +424,8 @@ def _generation_facts(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
     noise = {json.dumps([task.made.source, task.made.noise]): task.made for task in tasks if task.made.noise}
     labels = {"profile": "profile", "code_version": "icrl4aht-data", "jax_version": "JAX", "platform": "platform"}
     versions = {label: ", ".join(map(str, _distinct_values(tasks, name))) for name, label in labels.items()}
-    streams = defaultdict[tuple[int, int, float | None], list[str]](list)  # layouts by settings of the stream filter
+    # Names of the layouts by settings of the stream filter.
+    streams = defaultdict[tuple[int, int, float | None], list[str]](list)
     for task in tasks:
         made = task.made
         if made.filter and made.streams_kept:

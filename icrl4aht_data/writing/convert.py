@@ -42,7 +42,7 @@ def stored_task(
         without: names of fields to leave out of the histories.
     """
 
-    def load() -> Iterator[NewHistory]:
+    def load_histories() -> Iterator[NewHistory]:
         for history in dataset:
             yield NewHistory.from_history(history, kind, without)
             done()
@@ -54,7 +54,7 @@ def stored_task(
         files |= checkpoint_files(dataset.root / TEAMMATES, one, dataset.root)
     if provenance.expert is not None and (sha256 := provenance.expert.policy_sha256) is not None:
         files |= expert_files(dataset.origin.fetch_folder(expert_folder(sha256)), sha256, dataset.root)
-    return NewTask(task, provenance, len(dataset), load, files)
+    return NewTask(task, provenance, len(dataset), load_histories, files)
 
 
 def to_release(
@@ -86,14 +86,16 @@ def to_release(
     tasks, provenance = release_tasks(dataset), dataset.provenance
     numbers = iter(range(1, len(dataset) + 1))
 
-    def done() -> None:
+    def count_history() -> None:
         advance(next(numbers), len(dataset))
 
     return write_release(
         target,
         kind,
         [
-            stored_task(dataset.select([one.history_id for one in own]), tasks[name], provenance.of(name), kind, done)
+            stored_task(
+                dataset.select([one.history_id for one in own]), tasks[name], provenance.of(name), kind, count_history
+            )
             for name, own in grouped(dataset.entries, lambda entry: entry.task_id).items()
         ],
         data_version=dataset.info.data_version,

@@ -110,7 +110,7 @@ def to_minari(
 def _metadata(dataset: Dataset) -> dict[str, Any]:
     """Return the content of the metadata key `icrl4aht`."""
     first = {entry.task_id: entry for entry in dataset.entries}
-    names = ("task_id", "source", "env_idx", "learner", "episodes")  # `provenance` says which teammate plays
+    names = ("task_id", "source", "env_idx", "learner", "episodes")  # the teammates are in `provenance`
     return {
         "data_version": dataset.info.data_version,
         "kept_steps": dataset.info.environment.kept_steps,

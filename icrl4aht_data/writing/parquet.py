@@ -41,7 +41,7 @@ def to_parquet(dataset: Dataset, path: str | Path, *, overwrite: bool = False) -
 
     check_output(path, overwrite)
     if path.resolve().is_relative_to(dataset.root.resolve()):
-        raise OptionError(f"{path} is inside {dataset.root}, which is read; give another path")
+        raise OptionError(f"{path} is inside the release {dataset.root}; give a path outside of it")
     schema = index_schema().with_metadata({"icrl4aht-data": "index"})
     rows = arrow.Table.from_pylist([entry.to_row() for entry in dataset.entries], schema)
     with explain_full_disk(path), atomic_write(path) as partial, partial.open("wb") as stream:

@@ -189,7 +189,7 @@ def from_published(
     with _wrap_errors(f"{path}: cannot be opened as HDF5"):
         file = h5py.File(path, "r")
 
-    def load(task: Task, groups: list[_PublishedHistory]) -> Iterator[NewHistory]:
+    def load_histories(task: Task, groups: list[_PublishedHistory]) -> Iterator[NewHistory]:
         made = provenance.of(task.task_id)
         for group in groups:
             learner, stream = 0, group.line["env_idx"]
@@ -209,7 +209,7 @@ def from_published(
                 task,
                 _with_padding_note(provenance.of(task.task_id), members[0]),
                 len(members),
-                lambda task=task, members=members: load(task, members),
+                lambda task=task, members=members: load_histories(task, members),
             )
             for task, members in _tasks(histories, source, found)
         ]

@@ -64,7 +64,7 @@ def read_published_index(path: Path) -> list[dict[str, Any]]:
                 ((line["task_id"], line["env_idx"]), f"stream {line['env_idx']} of task {line['task_id']!r}"),
             ):
                 if (first := seen.setdefault(key, number)) != number:
-                    raise PublishedFormatError(f"{what} is already used by line {first}; expected one for each history")
+                    raise PublishedFormatError(f"{what} is already used by line {first}; each history needs its own")
         except (msgspec.ValidationError, Icrl4ahtError) as error:
             raise PublishedFormatError(f"{path}, line {number}: {error}") from error
         lines.append(line)
@@ -83,7 +83,9 @@ def _translate(line: dict[str, Any]) -> dict[str, Any]:
     new_family, new_kind = (new, kind) if new in FAMILIES else (_KINDS[new], new)
     if kind in _GENERAL:
         if new_family not in _GENERAL[kind]:
-            raise PublishedFormatError(f"teammate_family {family!r} is {new_family}, but teammate_kind is {kind!r}")
+            raise PublishedFormatError(
+                f"teammate_family {family!r} is {new_family}, but teammate_kind is {kind!r}; correct one of them"
+            )
         named = {value: name for name, value in HEURISTIC_KINDS.items()}.get(new_family, family)
         new_kind = named if new in FAMILIES else new
     return line | {"teammate_family": new_family, "teammate_kind": new_kind}

@@ -87,7 +87,7 @@ class NewTask:
 
     Args:
         task: the task; may be a `NamedTask` only in a release of observations.
-        provenance: how the histories were made; its `source`, by default "ppo", becomes that of the index entries.
+        provenance: how the histories were made; its `source` (default "ppo") becomes the source of the index entries.
         streams: number of histories that `load` returns, over all learners.
         load: function that returns the histories; it is called once, when the histories' shard is written.
         files: files to copy to the release, by path in the release; see `checkpoint_files`.
@@ -164,7 +164,7 @@ def write_release(
         with (root / HISTORIES).open("w", encoding="utf-8") as stream:
             stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in writer.entries)
         named_layouts = [*(one.task.layout_name for one in new), *(one.layout for one in left_out)]
-        write_layouts_file(root / LAYOUTS_FILE, map(get_layout, named_layouts))  # not the tasks' recipes
+        write_layouts_file(root / LAYOUTS_FILE, map(get_layout, named_layouts))  # with the layouts' own recipes
         known = [] if named else [one.task for one in new]
         write_tasks(root / TASKS, known)
         provenance = ProvenanceByTask((one.task.task_id, one.provenance) for one in new)
@@ -208,7 +208,7 @@ class _ShardWriter:
             entries = self._with_positions([entry for entry, _ in part], name)
             write_shard(self.root, name, self.kind, entries, [chunks for _, chunks in part])
             self.entries += entries
-        for _ in histories:  # ends the generator, so that `_load` checks the number and reports the last task
+        for _ in histories:  # ends the generator, so `_load` counts the histories and reports the last task
             pass
 
     def _load(self, new: NewTask) -> Iterator[tuple[Entry, list[EncodedChunk]]]:

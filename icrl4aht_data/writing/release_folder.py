@@ -65,7 +65,7 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
                     shutil.rmtree(leftover, ignore_errors=True)
                 try:
                     new.mkdir()
-                    with explain_full_disk(target):  # measures the free space before `new` is removed
+                    with explain_full_disk(target):  # the error states the free space before `new` is removed
                         yield new
                     check_target(target, overwrite, sources)
                     _replace(target, new, old)
@@ -96,7 +96,7 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
     for source in (Path(source) for source in sources if not is_address(source)):
         read = source.resolve()
         if read.is_relative_to(resolved) or resolved.is_relative_to(read):
-            raise OptionError(f"{target}: overlaps {source}, which is read; give another folder to write")
+            raise OptionError(f"{target}: overlaps the input folder {source}; give another folder to write")
     if not os.path.lexists(target) or (resolved.is_dir() and not any(resolved.iterdir())):
         return False
     if not overwrite:

@@ -368,7 +368,7 @@ class TestHeldOut:
 
     def test_dpt_training_without_labels_raises_error(self, tmp_path):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
-        with pytest.raises(LabelsMissingError, match=r"have no expert actions.*: use labels that all have"):
+        with pytest.raises(LabelsMissingError, match=r"have no expert actions.*: use labels that all histories have"):
             training_job(tmp_path / "r", "dpt")
 
 

@@ -73,7 +73,7 @@ def test_build_release_refuses_an_invalid_source(release_copy, tmp_path):
     with pytest.raises(ReleaseError, match=r"release: not valid: .*\.h5: sha256: expected .*; see `icrl4aht"):
         build_release(release_copy, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    with pytest.raises(OptionError, match=r"release: overlaps .*release, which is read"):
+    with pytest.raises(OptionError, match=r"release: overlaps the input folder .*release;"):
         build_release(release_copy, release_copy)
 
 

@@ -102,7 +102,8 @@ class TestMissingLabels:
         with pytest.raises(
             LabelsMissingError,
             match=r"^labels = oracle: 6 of 6 histories have no oracle actions, those of 2 tasks \(first: history 6 of "
-            r"task teammate_\S*\); 6 have expert actions, 0 have oracle actions: use labels that all have, or ",
+            r"task teammate_\S*\); 6 have expert actions, 0 have oracle actions: use labels that all histories "
+            r"have, or ",
         ):
             dataset.dpt(labels="oracle", **OPTIONS)
         with pytest.raises(LabelsMissingError, match=r"history 6 .* has no oracle actions"):

@@ -77,7 +77,7 @@ def test_combine_refuses_different_kinds_lengths_versions_and_formats(tmp_path):
         combine_releases(tmp_path / "out", [a, b])
     with pytest.raises(OptionError, match=r"c has environment .*kept_steps=10.*a has .*kept_steps=20"):
         combine_releases(tmp_path / "out", [a, c])
-    with pytest.raises(OptionError, match=r"a: overlaps .*a, which is read; give another folder"):
+    with pytest.raises(OptionError, match=r"a: overlaps the input folder .*a; give another folder"):
         combine_releases(a, [a, d])
     info = json.loads((d / INFO).read_text())
     (d / INFO).write_text(json.dumps(info | {"data_version": "0.0.2"}))

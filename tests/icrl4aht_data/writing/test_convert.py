@@ -78,9 +78,9 @@ def test_published_files_convert_back_to_the_same_release(lite, published_files,
 def test_a_release_is_not_written_over_its_source(lite, write):
     dataset = load_icrl4aht(lite[0])
     for target, message in (
-        (lite[0], r"lite: overlaps .*lite, which is read"),
-        (lite[0].parent, r": overlaps .*lite, which is read"),
-        (lite[0] / "out", r"out: overlaps .*lite, which is read"),
+        (lite[0], r"lite: overlaps the input folder .*lite;"),
+        (lite[0].parent, r": overlaps the input folder .*lite;"),
+        (lite[0] / "out", r"out: overlaps the input folder .*lite;"),
     ):
         with pytest.raises(OptionError, match=message):
             write(dataset, target, overwrite=True)
