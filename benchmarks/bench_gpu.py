@@ -192,7 +192,7 @@ def measure_training(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) 
             if not isinstance(error, MemoryError) and _OUT_OF_MEMORY not in str(error):
                 raise
             reason = str(error)
-        parts *= 2  # not in the except block, where the arrays of the failed attempt are still in memory
+        parts *= 2  # outside the except block, which keeps the arrays of the failed attempt in memory
     raise MemoryError(f"the batch does not fit into memory, however many parts it has: {reason}")
 
 
@@ -335,7 +335,7 @@ def main(parts: tuple[str, ...], cases: tuple[str, ...], minutes: float, small: 
     """Measure the speed of learning, training and evaluation on a GPU, and print a JSON line for each case."""
     pending = [name for name in CASES if (name in cases if cases else name.split("/")[0] in parts)]
     limit = Timer(60 * minutes, stop_at_limit, [pending])
-    limit.daemon = True  # an interrupted command ends at once
+    limit.daemon = True  # so that an interrupted command ends at once
     limit.start()
     sizes = FULL_SIZES
     if small or jax.default_backend() == "cpu":

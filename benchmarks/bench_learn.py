@@ -67,7 +67,7 @@ def heuristic_learner(layout: Layout, config: PPOConfig) -> Learner:
 
 
 def ego_updates(layout: Layout, config: PPOConfig) -> Callable[[], None]:
-    """Return a compiled function that makes `_UPDATES` updates of an ego and waits for the result."""
+    """Return a compiled function that updates an ego `_UPDATES` times and waits for the result."""
     learner = heuristic_learner(layout, config)
     update, state = compiled_update(learner), jax.jit(learner.init)(jax.random.key(0))
 
@@ -145,7 +145,7 @@ def ad_method(size: str, layouts: Sequence[Layout], view: BatchView | None = Non
 
 
 def training_steps(trainer: Trainer, batches: Iterator[Any], steps: int) -> Callable[[], None]:
-    """Return a compiled function that makes several training steps and waits for each of them."""
+    """Return a compiled function that runs several training steps and waits for each of them."""
     state = trainer.init()
 
     def run(count: int = steps) -> None:

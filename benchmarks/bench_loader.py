@@ -158,7 +158,7 @@ def compare_readers(folder: Path, batch: int, length: int, rounds: int, threads:
         held, buffer = "", None
         for (cache, obs), sampler in samplers.items():
             if obs != held:
-                buffer = None  # keeps one buffer at a time, since float32 batches are large
+                buffer = None  # only one buffer at a time is kept, since float32 batches are large
                 held, buffer = obs, sampler.empty()
             rates[cache, obs].append(batch / batch_seconds(sampler, buffer, cache, 1000 * number + 1))
     for (cache, obs), peer in product(samplers, peers):

@@ -103,17 +103,17 @@ class Scene:
         return unpack(self.tables, self.record)
 
     @cached_property
-    def cell(self) -> Int[Array, " cells"]:
+    def cells(self) -> Int[Array, " cells"]:
         """Numbers of all cells."""
         return jnp.arange(self.tables.kinds.shape[0])
 
     @cached_property
-    def me(self) -> Int[Array, ""]:
+    def own_cell(self) -> Int[Array, ""]:
         """Number of the agent's cell."""
         return self.state.positions[self.slot].astype(jnp.int32)
 
     @cached_property
-    def partner(self) -> Int[Array, ""]:
+    def partner_cell(self) -> Int[Array, ""]:
         """Number of the partner's cell."""
         return self.state.positions[1 - self.slot].astype(jnp.int32)
 
@@ -155,9 +155,9 @@ class Scene:
         """Return the mask of cells next to a cell of a kind: above, below, left or right."""
         return (jnp.asarray(self.tables.near) >> kind & 1) > 0
 
-    def at(self, kind: int, values: Array) -> Array:
+    def values_on_cells(self, kind: int, values: Array) -> Array:
         """Return a value for each cell: the value of the pot, button or counter on the cell, or 0."""
-        # This uses a gather, because a scatter by traced values is slow under vmap.
+        # A gather is used, because a scatter by traced values is slow under vmap.
         number = jnp.asarray(self.tables.number)
         if not values.shape[0]:
             return jnp.zeros(number.shape, values.dtype)
@@ -175,15 +175,15 @@ class Scene:
     @cached_property
     def fillable_pot_cells(self) -> Bool[Array, " cells"]:
         """Mask of the cells of pots that take another ingredient."""
-        return self.at(POT, self.fillable_pots)
+        return self.values_on_cells(POT, self.fillable_pots)
 
     @cached_property
     def cooking(self) -> Bool[Array, " cells"]:
-        return self.at(POT, self.state.pot_timers > 0)
+        return self.values_on_cells(POT, self.state.pot_timers > 0)
 
     @cached_property
     def cooked(self) -> Bool[Array, " cells"]:
-        return self.at(POT, (self.state.pot_items & COOKED) > 0)
+        return self.values_on_cells(POT, (self.state.pot_items & COOKED) > 0)
 
     @cached_property
     def pots(self) -> Bool[Array, " cells"]:
@@ -192,18 +192,18 @@ class Scene:
     @cached_property
     def pots_in_use(self) -> Bool[Array, " cells"]:
         """Mask of pots that contain ingredients, raw, cooking or cooked."""
-        return self.at(POT, self.state.pot_items > 0)
+        return self.values_on_cells(POT, self.state.pot_items > 0)
 
     @cached_property
     def counter_ingredients(self) -> Bool[Array, " cells"]:
         """Mask of counters with an ingredient on top."""
-        return self.at(WALL, is_ingredient(self.state.counters))
+        return self.values_on_cells(WALL, is_ingredient(self.state.counters))
 
     @cached_property
     def empty_counters(self) -> Bool[Array, " cells"]:
         """Mask of walls and counters without an item, also unreachable walls."""
-        # The published teammates also target unreachable walls; `first` then skips the rule.
-        taken = self.at(WALL, self.state.counters > 0)
+        # The published teammates also target unreachable walls; `first` skips rules without a reachable target.
+        taken = self.values_on_cells(WALL, self.state.counters > 0)
         return self.cells_of_kind(WALL) & ~taken
 
     @cached_property
@@ -213,12 +213,14 @@ class Scene:
     @cached_property
     def needed(self) -> Int[Array, " 3"]:
         """Number of pieces of each ingredient that the recipe still needs, given the contents of all pots together."""
-        # As in the published code, the contents of all pots are added, as if all were in a single pot.
-        return jnp.maximum(self.counts(self.state.recipe) - self.counts(self.state.pot_items).sum(axis=0), 0)
+        # As in the published code, the contents of all pots are added up as if they were in one pot.
+        return jnp.maximum(
+            self.ingredient_counts(self.state.recipe) - self.ingredient_counts(self.state.pot_items).sum(axis=0), 0
+        )
 
     @staticmethod
-    def counts(item: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
-        """Return an item's number of pieces of each ingredient of the layout, by ascending id; unused entries are 0."""
+    def ingredient_counts(item: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
+        """Return how many pieces of each of the layout's ingredients an item has, by ascending id; padded with 0."""
         # An item byte has two bits for each ingredient, above the bits of plate and cooked.
         shift = 2 + 2 * jnp.arange(3, dtype=jnp.uint8)
         return (item[..., None] >> shift & 3).astype(jnp.int32)
@@ -226,7 +228,7 @@ class Scene:
     def piles_of(self, wanted: Bool[Array, " 3"]) -> Bool[Array, " cells"]:
         """Return the mask of piles of the wanted ingredient types."""
         piles = jnp.asarray(self.tables.piles)
-        return jnp.any((self.counts(piles) > 0) & wanted, axis=-1) & self.cells_of_kind(PILE)
+        return jnp.any((self.ingredient_counts(piles) > 0) & wanted, axis=-1) & self.cells_of_kind(PILE)
 
     @cached_property
     def needed_piles(self) -> Bool[Array, " cells"]:
@@ -234,7 +236,7 @@ class Scene:
 
     @cached_property
     def recipe_piles(self) -> Bool[Array, " cells"]:
-        return self.piles_of(self.counts(self.state.recipe) > 0)
+        return self.piles_of(self.ingredient_counts(self.state.recipe) > 0)
 
     @cached_property
     def goals(self) -> Bool[Array, " cells"]:
@@ -260,7 +262,7 @@ class Scene:
 
     @cached_property
     def _target_distance(self) -> Int[Array, " cells"]:
-        return _path_length(jnp.asarray(self.tables.target_distance)[self.me])
+        return _path_length(jnp.asarray(self.tables.target_distance)[self.own_cell])
 
     def manhattan(self, cell: Int[Array, "*B"], other: Int[Array, "*B"]) -> Int[Array, "*B"]:
         """Return the Manhattan distance of two cells, or of broadcast arrays of cells."""
@@ -275,29 +277,29 @@ class Scene:
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         return jnp.where(inside, y * width + x, -1)
 
-    def access(self, target: Int[Array, ""]) -> Int[Array, " 4"]:
-        """Return the floor cells above, below, left and right of a cell; -1 for other cells."""
+    def access_cells(self, target: Int[Array, ""]) -> Int[Array, " 4"]:
+        """Return the floor cells above, below, left and right of a cell; -1 for neighbours that are not floor."""
         cells = self.neighbours(target)
         return jnp.where((cells >= 0) & jnp.asarray(self.tables.walkable)[cells], cells, -1)
 
-    def single_access(self, target: Int[Array, ""]) -> Int[Array, ""]:
+    def single_access_cell(self, target: Int[Array, ""]) -> Int[Array, ""]:
         """Return the only access cell of a target; -1 if the target has none or several."""
-        access = self.access(target)
+        access = self.access_cells(target)
         return jnp.where(jnp.sum(access >= 0) == 1, jnp.max(access), -1)
 
     def first_step(self, cell: Int[Array, ""]) -> Int[Array, ""]:
         """Return the action of the first step towards a floor cell."""
-        return jnp.asarray(self.tables.first_step)[self.me, cell].astype(jnp.int32)
+        return jnp.asarray(self.tables.first_step)[self.own_cell, cell].astype(jnp.int32)
 
-    def reach(self, mask: Bool[Array, " cells"]) -> Bool[Array, " cells"]:
-        """Return the mask of cells in `mask` next to a floor cell that the agent can reach."""
+    def reachable(self, mask: Bool[Array, " cells"]) -> Bool[Array, " cells"]:
+        """Return the mask's cells that are next to a floor cell that the agent can reach."""
         return mask & (self._target_distance < UNREACHABLE)
 
     def nearest_distance(self, mask: Bool[Array, " cells"]) -> Int[Array, ""]:
         """Return the distance to the nearest access cell of the mask's cells; UNREACHABLE without a path."""
         return jnp.min(jnp.where(mask, self._target_distance, UNREACHABLE))
 
-    def closest(self, mask: Bool[Array, " cells"]) -> Int[Array, ""]:
+    def nearest_cell(self, mask: Bool[Array, " cells"]) -> Int[Array, ""]:
         """Return the nearest cell of the mask, with ties in reading order; undefined if no cell is reachable."""
         return jnp.argmin(jnp.where(mask, self._target_distance, UNREACHABLE))
 
@@ -305,10 +307,10 @@ class Scene:
         """Return the first rule that applies, with the rule's nearest target."""
         # All rules are evaluated, because a branch would run both sides under vmap anyway.
         targets = jnp.stack([rule.targets for rule in rules])
-        possible = jnp.stack([rule.when for rule in rules]) & jnp.any(self.reach(targets), axis=-1)
+        possible = jnp.stack([rule.when for rule in rules]) & jnp.any(self.reachable(targets), axis=-1)
         number = jnp.argmax(possible)
         waits = jnp.asarray(np.array([rule.waits for rule in rules]))[number]
-        return ChosenRule(jnp.any(possible), number, self.closest(targets[number]), waits)
+        return ChosenRule(jnp.any(possible), number, self.nearest_cell(targets[number]), waits)
 
     def approach(
         self, target: Int[Array, ""], extra: Float[Array, " cells"] | None = None
@@ -317,10 +319,10 @@ class Scene:
 
         The cost is the distance, plus 100 if the partner is on the cell, plus `extra` (cells,).
         """
-        access = self.access(target)
-        # 100 is more than any path, so an occupied access cell is only chosen if no other exists.
-        distance = jnp.where(access >= 0, self.distances(self.me)[access], UNREACHABLE)
-        cost = distance + 100 * (access == self.partner)
+        access = self.access_cells(target)
+        # No path is as long as 100, so an occupied access cell is only chosen if no other can be reached.
+        distance = jnp.where(access >= 0, self.distances(self.own_cell)[access], UNREACHABLE)
+        cost = distance + 100 * (access == self.partner_cell)
         if extra is not None:
             cost = cost + extra[access]
         best = jnp.argmin(cost)
@@ -336,28 +338,28 @@ class Scene:
 
         The argument `step` replaces the step of `approach`.
         """
-        adjacent = self.manhattan(self.me, target) == 1
-        direction = jnp.argmax(self.neighbours(self.me) == target)  # up, down, left, right
+        adjacent = self.manhattan(self.own_cell, target) == 1
+        direction = jnp.argmax(self.neighbours(self.own_cell) == target)  # number of the action up, down, left or right
         faced = jnp.asarray(_ACTION_OF_FACING)[self.state.facings[self.slot].astype(jnp.int32)]
         # A move towards an adjacent target only turns the agent, because targets block the move.
         action = jnp.where(faced == direction, jnp.where(waits, STAY, INTERACT), direction)
         return jnp.where(adjacent, action, self.approach(target)[0] if step is None else step)
 
     @cached_property
-    def ways(self) -> Int[Array, " 4"]:
+    def move_cells(self) -> Int[Array, " 4"]:
         """Cells to which a move right, down, left or up leads; the agent's cell if the move is blocked."""
-        return jnp.asarray(self.tables.moves)[self.me, jnp.array(SEARCH_ORDER)].astype(jnp.int32)
+        return jnp.asarray(self.tables.moves)[self.own_cell, jnp.array(SEARCH_ORDER)].astype(jnp.int32)
 
     @cached_property
-    def free(self) -> Bool[Array, " 4"]:
-        """Whether the move right, down, left or up is possible, as neither the map nor the partner blocks it."""
-        return (self.ways != self.me) & (self.ways != self.partner)
+    def free_moves(self) -> Bool[Array, " 4"]:
+        """Whether neither the map nor the partner blocks a move right, down, left or up."""
+        return (self.move_cells != self.own_cell) & (self.move_cells != self.partner_cell)
 
     def sidestep(self, otherwise: Int[Array, ""] | int) -> Int[Array, ""]:
         """Return the first free move in the order right, down, left, up, or `otherwise` if no move is free."""
-        return self.best_way(self.free, jnp.zeros(4), otherwise)
+        return self.best_move(self.free_moves, jnp.zeros(4), otherwise)
 
-    def best_way(
+    def best_move(
         self,
         allowed: Bool[Array, " 4"],
         score: Int[Array, " 4"] | Float[Array, " 4"],
@@ -368,14 +370,16 @@ class Scene:
         return jnp.where(jnp.any(allowed), jnp.asarray(SEARCH_ORDER)[best], otherwise)
 
     def wander(self, stay_score: int = 50) -> Int[Array, ""]:
-        """Return a step onto a free neighbour cell, else `stay`, or a push of the partner if `stay_score` > 100."""
-        target = jnp.asarray(self.tables.moves)[self.me].astype(jnp.int32)
-        # Published costs: pushing the partner costs 100, so a `stay_score` above 100 prefers pushing to staying.
-        scores = [jnp.where(target[a] == self.me, 1000, 100 * (target[a] == self.partner)) for a in SEARCH_ORDER]
+        """Return a step to a free neighbour cell; without one, `stay`, or push the partner if `stay_score` > 100."""
+        target = jnp.asarray(self.tables.moves)[self.own_cell].astype(jnp.int32)
+        # As in the published code, pushing costs 100, so a `stay_score` above 100 prefers pushing to staying.
+        scores = [
+            jnp.where(target[a] == self.own_cell, 1000, 100 * (target[a] == self.partner_cell)) for a in SEARCH_ORDER
+        ]
         best = jnp.argmin(jnp.stack([*scores, jnp.asarray(stay_score)]))
         return jnp.asarray((*SEARCH_ORDER, STAY))[best]
 
     def destination(self, action: Int[Array, ""]) -> Int[Array, ""]:
         """Return the cell to which a move action points, ignoring walls; the agent's cell for other actions."""
-        ahead = self.neighbours(self.me)[jnp.minimum(action, 3)]
-        return jnp.where(action < 4, ahead, self.me)
+        ahead = self.neighbours(self.own_cell)[jnp.minimum(action, 3)]
+        return jnp.where(action < 4, ahead, self.own_cell)

@@ -40,7 +40,8 @@ class Policy(NamedTuple):
     Attributes:
         params: pytree of arrays that the functions take as an argument, so that policies which differ only in their
             parameters share one compilation.
-        init: (params, key) -> memory, any pytree, at the start of an episode; for egos in evaluation, of a task.
+        init: (params, key) -> memory, any pytree, at the start of an episode; for egos in evaluation, at the start
+            of a task.
         act: (params, memory, view, key) -> action, int32 () in 0..5, and the memory after the step.
         sees: content of `view`: "state" for the state record, uint8 (S,); "situation" for a `Situation`, by which one
             policy plays every layout; "observation" for uint8 (5, 5, C);
@@ -55,7 +56,7 @@ class Policy(NamedTuple):
 
     @property
     def label_view(self) -> LabelView:
-        """What this policy sees when it labels: "state" for the full state, "ego" for the observations of an ego."""
+        """Input of this policy when it labels histories: "state" for full states, "ego" for an ego's observations."""
         return "state" if self.sees in ("state", "situation") else "ego"
 
 

@@ -35,11 +35,11 @@ def _delivery_fault(layout: Layout) -> str | None:
     counters = bool((reach.all(axis=0) & (layout.kinds == WALL)).any())
 
     def agents_at(fixtures: np.ndarray) -> np.ndarray:
-        """Return bool (2,): which agents can face at least one of the cells `fixtures`, bool (N,)."""
+        """Return which agents, bool (2,), can face at least one of the cells `fixtures`, bool (N,)."""
         return np.any(reach & fixtures, axis=1)
 
     def after_handover(agents: np.ndarray) -> np.ndarray:
-        """Return bool (2,): which agents can hold an item that the given agents, bool (2,), can take or hand over."""
+        """Return which agents, bool (2,), can hold an item that the given agents, bool (2,), can take or hand over."""
         return agents | (counters and agents.any())
 
     for kind, what in _NEEDED.items():

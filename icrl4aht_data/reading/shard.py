@@ -100,7 +100,7 @@ class Shard:
         self.datasets = [(entry, field) for entry in entries for field in entry.stored_fields(self.kind)]
         self._cache = cache
         self._elements = {field.name: field.element(self.layout, self.kind) for field in FIELDS.values()}
-        self._first: dict[tuple[int, str], int] = {}  # (history id, field) -> row of its first chunk in the table
+        self._first: dict[tuple[int, str], int] = {}  # row of the first chunk in the table by (history id, field)
         location.fetch([chunk_table_name(name), name])
         self.table = read_table(location.file(chunk_table_name(name)))
         self._check_table()

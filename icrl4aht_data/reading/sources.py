@@ -76,7 +76,7 @@ def choose_cache(cache: CacheMode, size: int) -> CacheChoice:
 
 
 def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episodes: int) -> int:
-    """Return the size in bytes of the decoded arrays of one layout's histories, given total `steps` and `episodes`."""
+    """Return the size in bytes of one layout's decoded histories, from their total numbers of steps and episodes."""
     rows = {"T": steps + histories + 1, "E": episodes}
     return sum(rows[field.axis] * field.memory_dtype(layout).itemsize for field in memory_fields(kind))
 
@@ -121,7 +121,7 @@ def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: i
 def _decode(
     entries: Sequence[Entry], shards: Sequence[Shard], threads: int, folder: Path | None = None
 ) -> dict[str, np.ndarray]:
-    """Decode one layout's histories to field -> array (rows, ...), in memory or memory-mapped in files of a folder."""
+    """Decode one layout's histories to arrays (rows, ...) by field, in memory or memory-mapped in files of a folder."""
     arrays = {}
     for field in memory_fields(shards[0].kind):
         if any(entry.has(field) for entry in entries):

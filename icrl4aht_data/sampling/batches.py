@@ -171,7 +171,7 @@ class Batches(Iterator[B], Generic[B]):
             raise OptionError(f"state = {state!r:.100}: expected the result of state_dict()")
         expected, given = self._sampler.options(), {name: value for name, value in state.items() if name != "next"}
         if "channels" in expected:
-            given.setdefault("channels", "own")  # states of version 0.1 do not contain this option
+            given.setdefault("channels", "own")  # states of version 0.1 have no `channels`
         if "order" in expected:
             given.setdefault("labels", "expert")  # older DPT states have no `labels`; labels were always "expert"
         wrong = [name for name in expected.keys() | given.keys() if expected.get(name) != given.get(name)]

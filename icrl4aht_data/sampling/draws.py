@@ -190,7 +190,7 @@ def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[n
     """Return the first episode and the end (exclusive) of a range in histories of `counts` episodes, int64 (H,) each.
 
     Raises:
-        OptionError: if the range is malformed, or some history has no episode in it.
+        OptionError: if the range is malformed, or some history has no episode in the range.
     """
     if episodes is None:
         return np.zeros_like(counts), counts

@@ -24,7 +24,7 @@ def combine_releases(
 ) -> Path:
     """Combine releases, or selections of their histories, into one release whose histories are numbered from 0.
 
-    As in new releases, a task's oracle actions are left out if the oracle earns less than the histories at their end.
+    As in new releases, a task's oracle actions are left out if the oracle earns less than the histories' final return.
 
     Args:
         target: the folder to write.

@@ -87,7 +87,7 @@ class NewTask:
 
     Args:
         task: the task; may be a `NamedTask` only in a release of observations.
-        provenance: how the histories were made; its `source`, by default "ppo", becomes that of the index entries.
+        provenance: how the histories were made; its `source` (default "ppo") becomes the source of the index entries.
         streams: number of histories that `load` returns, over all learners.
         load: function that returns the histories; it is called once, when the histories' shard is written.
         files: files to copy to the release, by path in the release; see `checkpoint_files`.

@@ -226,7 +226,7 @@ def test_sampled_and_spread_teammates_must_be_on_different_layouts(changed, smal
 
 
 def test_profile_with_too_many_spread_teammates_raises_error(changed, small_lists):
-    with pytest.raises(OptionError, match=r"mine.toml: coord_simple: 5 train teammates requested of .* which has 4"):
+    with pytest.raises(OptionError, match=r"mine.toml: coord_simple: 5 train teammates requested from .* which has 4"):
         spread_profile(changed, "", "per_layout = 5")
 
 

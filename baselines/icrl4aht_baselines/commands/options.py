@@ -31,6 +31,7 @@ from icrl4aht_data.commands.options import (
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.text import counted_noun
 
 
 def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
@@ -188,10 +189,10 @@ def prepare_training(
         options = TrainOptions(**RL2_SETTINGS["train"] | train)
         tasks = [task for manifest in manifests for task in read_tasks_and_layouts(manifest)]
         job = prepare_play(method, sized, options, PlayOptions(**play), histories, tasks)
-        played = job.about["histories"]
+        played, episodes = job.about["histories"], counted_noun(job.trainer.play.episodes, "episode")
         text = (
             f"{method}: layers {sized.recurrent_layers}, width {sized.width}, encoder {sized.encoder}, steps "
-            f"{options.steps}, each an episode of {len(job.trainer.tasks)} tasks\nplaying on "
+            f"{options.steps}, in each {len(job.trainer.tasks)} tasks of {episodes}\nplaying on "
             f"{', '.join(played['layouts'])}, canonical channels, with the teammates of {len(played['groups'])} "
             f"families and layouts"
         )

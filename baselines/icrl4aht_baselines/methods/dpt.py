@@ -94,8 +94,8 @@ class DPT(nn.Module):
         features, answers = features[:, :length], features[:, length:]
         predicted = None
         if self.next_obs is not None:
-            # A transition's token includes the next observation. Therefore the next observation is predicted from the
-            # features of the previous transition and the encoding of the transition's first observation.
+            # A transition's token includes the next observation, so the prediction must not use this token.
+            # It uses the features of the previous transition and the encoding of the observation before the action.
             known = jnp.concatenate([features[:, :-1], obs_features[:, 1:]], axis=-1)
             predicted = self.next_obs(known, context.action[:, 1:])
         return DPTOutput(self.head(answers), predicted)

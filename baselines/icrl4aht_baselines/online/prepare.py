@@ -78,7 +78,8 @@ def prepare_play(
     hidden = [get_layout(one).name for one in histories.hide_recipe]
     groups = _task_groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
     # With few tasks, some teammates are in no group, so the record of training data must not state them.
-    played = [task for group in groups for task in group]
+    searched = {layout for layout, _ in teammates if _wants_hidden_dish(layout)}
+    played = [task._replace(searched=task.layout in searched) for group in groups for task in group]
     labels: Labels | None = "oracle" if play.imitation else None
     about = {
         "model": asdict(model),
@@ -91,6 +92,7 @@ def prepare_play(
             "channels": "canonical",
             "obs_shape": list(observation_shape(layouts[0], True)),
             "groups": {group[0].name: len(group) for group in groups},
+            "searched": sorted({layout.name for layout in searched}),
         },
         "trained_on": _training_record(dataset, tasks, {task.id for task in played}, labels),
     }
@@ -191,6 +193,11 @@ def _task_groups(
         count = round((tasks - fixed) * share / sum(rearranged.values()))
         groups += _rearranged_groups(layout, heuristics[layout], count, play.rearranged, layout.name in hidden)
     return groups
+
+
+def _wants_hidden_dish(layout: Layout) -> bool:
+    """Return whether the tasks on a layout always want one of its dishes, which the ego does not see."""
+    return layout.recipes != get_layout(layout.name).recipes and not layout.shows_recipe
 
 
 def _heuristic_teammates(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, Policy]]]:

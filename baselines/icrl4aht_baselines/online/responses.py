@@ -77,12 +77,12 @@ def find_behaviours(tasks: Iterable[Task]) -> list[tuple[Task, ...]]:
     `teammates.distances` is below `SAME_BEHAVIOUR`. On layouts without test tasks, teammates are not compared.
     """
 
-    def group(task: Task) -> tuple[Any, ...]:
+    def group_key(task: Task) -> tuple[Any, ...]:
         alone = task.task_id if task.layout.name not in LAYOUT_NAMES else ""
         return task.split, task.layout.name, task.recipes, task.teammate_kind, alone
 
     found = []
-    for own in grouped(tasks, group).values():
+    for own in grouped(tasks, group_key).values():
         if len(own) == 1:
             found.append((own[0],))
             continue
@@ -113,7 +113,7 @@ def tasks_with_headroom(tasks: Iterable[Task]) -> list[Task]:
 
 @dataclass(frozen=True)
 class EgoJob(TrainingJob):
-    """Job that trains an ego by playing and measures it.
+    """Job that trains an ego by playing and measures its returns.
 
     Attributes:
         tasks: the tasks that the ego plays.

@@ -1,14 +1,16 @@
 """Training of RL^2 (Duan et al. 2016): PPO on episodes that the model plays with a release's teammates.
 
-A training step plays one episode of every task, then updates the model on all of them. After an episode, a task
-continues with the model's recurrent state, or ends at random; then a new task with the same teammate begins. Returns
-include the rewards of later episodes of the task, so exploration that helps later is rewarded.
+A training step plays one or more episodes of every task, then updates the model on all of them. After these episodes, a
+task continues with the model's recurrent state, or ends at random; then a new task with the same teammate begins.
+Returns include the rewards of later episodes of the task, so exploration that helps later is rewarded. Gradients pass
+through all episodes of a step, so with several the model learns to remember what a later episode needs.
 
-At first the model also imitates the scripted oracle: the loss contains the cross-entropy of the oracle's actions in the
-states that the model visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al.
-2011). Imitation ends because the oracle knows what the model has to find out.
+At first the model also imitates a script: the loss contains the cross-entropy of the script's actions in the states
+that the model visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al. 2011). The
+script is the oracle, which knows what the model has to find out. In tasks with a hidden dish, the script is the
+searcher, which finds out the dish over the episodes of a task.
 
-Shapes: `B` tasks, `T` steps of an episode, `S` size of the recurrent state.
+Shapes: `B` tasks, `E` episodes of a step, `T` steps of all these episodes, `S` size of the recurrent state.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from icrl4aht_generation.collection.curate import follow_oracle
+from icrl4aht_generation.collection.curate import follow_script
+from icrl4aht_generation.experts.oracle import oracle
+from icrl4aht_generation.experts.search import searcher
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.ppo import PPO, Sequences, ppo_optimizer
 from icrl4aht_generation.learners.rollout import select_rows
@@ -56,12 +60,14 @@ class PlayerMemory(NamedTuple):
         state: float32 (S,), recurrent state of the model.
         started: bool (), whether a step of the task was played; if not, the outcome of the previous step is zero.
         partner: int32 (), number of the teammate for an informed model; None for other models.
+        searcher: memory of the searcher if the model imitates it; None otherwise.
     """
 
     change: ViewChange
     state: Float[Array, " S"]
     started: Bool[Array, ""]
     partner: Int[Array, ""] | None = None
+    searcher: Any = None
 
 
 class PlayState(NamedTuple):
@@ -81,7 +87,7 @@ class PlayState(NamedTuple):
 
 
 class PlayTask(NamedTuple):
-    """A training task. A training step plays one episode of every task.
+    """A training task. A training step plays episodes of every task.
 
     Attributes:
         layout: layout of the task.
@@ -91,6 +97,7 @@ class PlayTask(NamedTuple):
         label: name of the layout in the log.
         partner: number of the teammate, for an informed model; None for other models.
         id: id of the task that the teammate comes from; empty if it is not recorded.
+        searched: whether the model imitates the searcher instead of the oracle.
     """
 
     layout: Layout
@@ -100,6 +107,7 @@ class PlayTask(NamedTuple):
     label: str
     partner: int | None = None
     id: str = ""
+    searched: bool = False
 
     @property
     def name(self) -> str:
@@ -186,34 +194,68 @@ class _Player:
             np.array([number[task.layout] for task in tasks]) if several else None,
         )
         self.mates = self.rollout.teammate_params
+        self._searched = tasks[0].searched
+        own = self.rollout.layout
+        self._script = searcher(own, advises=True) if self._searched else oracle(own)
 
     def start(self, key: Key[Array, ""]) -> RolloutState:
         """Return the state before the first episode of all tasks."""
         env_key, change_key = jax.random.split(key)
         state = self.rollout.start(jax.random.split(env_key, len(self.tasks)))
-        return state._replace(ego=state.ego._replace(change=self._draw_change(change_key), partner=self._partners))
+        memory = state.ego._replace(change=self._draw_change(change_key), partner=self._partners)
+        return state._replace(ego=memory._replace(searcher=self._new_searcher(key)))
+
+    def _new_searcher(self, key: Key[Array, ""]) -> Any:
+        """Return the searcher's memory at the start of every task; None if the model imitates the oracle."""
+        if not self._searched:
+            return None
+        keys = jax.random.split(jax.random.fold_in(key, 1), len(self.tasks))
+        return jax.vmap(self._script.init, in_axes=(None, 0))(self._script.params, keys)
 
     def _draw_change(self, key: Key[Array, ""]) -> ViewChange:
         chance = 0.5 if self._mirror else 0.0
         upside_down, sideways = jax.random.bernoulli(key, chance, (2, len(self.tasks)))
         return ViewChange(jnp.asarray(self._hidden), upside_down, sideways)
 
-    def episode(
+    def episodes(
         self, params: Any, mates: Any, state: RolloutState, key: Key[Array, ""]
-    ) -> tuple[RolloutState, Sequences, Float[Array, " B"]]:
-        """Play one episode of every task. Return the state after it, the episode for learning, and the returns."""
+    ) -> tuple[RolloutState, Sequences, Float[Array, "B E"]]:
+        """Play the next episodes of every task. Return the next state, the episodes for learning, and their returns."""
         change_key, end_key = jax.random.split(key)
-        after, played = self.rollout.episode(params, mates, state)
+
+        def episode(state: RolloutState, _: None) -> tuple[RolloutState, tuple[EpisodeBatch, Array]]:
+            after, played = self.rollout.episode(params, mates, state)
+            records, taken = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions[..., EGO]))
+            layout, memory = self.rollout.layout, state.ego.searcher
+            expert, memory = follow_script(self._script, layout, records, taken, state.env.layout, memory)
+            ego = after.ego._replace(searcher=memory if self._searched else None)
+            return after._replace(ego=ego), (played, expert)
+
+        after, (played, expert) = jax.lax.scan(episode, state, length=self._play.episodes)
+        returns = jnp.swapaxes(played.reward.sum(axis=-1), 0, 1)
+        # The episodes of a task follow one another: (E, B, 100, ...) becomes (B, E * 100, ...).
+        played = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:]), played)
         ended = jax.random.bernoulli(end_key, self._play.task_end, (len(self.tasks),))
-        sequences = self._sequences(params, state, after, played, ended)
+        sequences = self._sequences(params, state, after, played, expert.reshape(-1, len(self.tasks)), ended)
         # A new task has the same teammate, but another view, a zero state and no previous step.
-        begun = select_rows(ended, self._draw_change(change_key), after.ego.change)
-        memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state), ~ended, state.ego.partner)
+        memory = PlayerMemory(
+            select_rows(ended, self._draw_change(change_key), after.ego.change),
+            jnp.where(ended[:, None], 0.0, after.ego.state),
+            ~ended,
+            state.ego.partner,
+            select_rows(ended, self._new_searcher(key), after.ego.searcher),
+        )
         before = select_rows(ended, no_outcome(len(self.tasks)), after.before)
-        return RolloutState(after.env, memory, before), sequences, played.reward.sum(axis=-1)
+        return RolloutState(after.env, memory, before), sequences, returns
 
     def _sequences(
-        self, params: Any, state: RolloutState, after: RolloutState, played: EpisodeBatch, ended: Bool[Array, " B"]
+        self,
+        params: Any,
+        state: RolloutState,
+        after: RolloutState,
+        played: EpisodeBatch,
+        expert: Int[Array, "T B"],
+        ended: Bool[Array, " B"],
     ) -> Sequences:
         env, change = self.rollout.env, state.ego.change
         record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))
@@ -229,7 +271,7 @@ class _Player:
             partner=None if state.ego.partner is None else jnp.tile(state.ego.partner, (len(record) + 1, 1)),
         )
         if self._changes:
-            # Only the first step of an episode can be the first step of a task.
+            # Only the first of these steps can be the first step of a task.
             started = jnp.ones((len(record) + 1, len(self.tasks)), bool).at[0].set(state.ego.started)
             steps = seen_steps(change, steps, started)
         # Log-probabilities and values are computed again with the operations of the loss, so that both agree exactly.
@@ -238,7 +280,7 @@ class _Player:
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits[:-1]), action[..., None], axis=-1)[..., 0]
         return Sequences(
             seen=jax.tree.map(lambda leaf: leaf[:-1], steps),
-            reset=jnp.zeros(reward.shape, bool),  # the recurrent state is never reset within an episode
+            reset=jnp.zeros(reward.shape, bool),  # the recurrent state is never reset within a task
             action=action,
             log_prob=log_prob,
             value=value[:-1],
@@ -249,8 +291,8 @@ class _Player:
             partner=jnp.zeros((1, len(self.tasks)), jnp.int32),  # one value function for all teammates
             weight=jnp.ones((1, len(self.tasks))),
             last_value=value[-1][None],
-            # The oracle's actions are converted from the environment's view to the model's view.
-            expert=change.actions(follow_oracle(self.rollout.layout, record, taken, state.env.layout)),
+            # The script's actions are converted from the environment's view to the model's view.
+            expert=change.actions(expert),
         )
 
 
@@ -259,7 +301,8 @@ def make_players(tasks: Sequence[PlayTask], method: Method, play: PlayOptions, m
 
     def program(task: PlayTask) -> tuple[Any, ...]:
         mate = task.teammate
-        return (task.family, mate.init, mate.act) if mate.sees == "situation" else (task.family, task.layout)
+        shared = (mate.init, mate.act) if mate.sees == "situation" else (task.layout,)
+        return (task.family, task.searched, *shared)
 
     return [_Player(own, method, play, mirror) for own in grouped(tasks, program).values()]
 
@@ -333,9 +376,9 @@ class PlayTrainer:
         # Minibatches have equal sizes, so a pass leaves out up to minibatches - 1 tasks, different ones in each pass.
         learned = len(self.tasks) - len(self.tasks) % play.minibatches
         config = PPOConfig(
-            total_steps=options.steps * learned * KEPT_STEPS,
+            total_steps=options.steps * learned * play.episodes * KEPT_STEPS,
             environments=learned,
-            rollout=KEPT_STEPS,
+            rollout=play.episodes * KEPT_STEPS,
             epochs=play.epochs,
             minibatches=play.minibatches,
             learning_rate=options.learning_rate,
@@ -373,14 +416,14 @@ class PlayTrainer:
         return []
 
     def step(self, state: PlayState, number: int) -> tuple[PlayState, dict[str, Array]]:
-        """Play one episode of every task and update the model. Return the new state, and the numbers to log."""
+        """Play the next episodes of every task and update the model. Return the new state, and the numbers to log."""
         # Random keys depend on the seed and the step only, so that a resumed run plays the same episodes.
         play_key, learn_key = jax.random.split(jax.random.fold_in(jax.random.key(self.options.seed + 1), number))
         keys = jax.random.split(play_key, len(self.players))
         programs = self.programs(state.params, state.tasks)
         played = [
-            episode(state.params, player.mates, tasks, key)
-            for episode, player, tasks, key in zip(programs, self.players, state.tasks, keys, strict=True)
+            play(state.params, player.mates, tasks, key)
+            for play, player, tasks, key in zip(programs, self.players, state.tasks, keys, strict=True)
         ]
         tasks, sequences, returns = zip(*played, strict=True)
         # Minibatches are sampled from all groups together, so that each one has many layouts.
@@ -402,23 +445,23 @@ class PlayTrainer:
         found = []
         keys = [jax.random.fold_in(jax.random.key(seed), number) for number in range(len(self.players))]
         states = [jax.jit(player.start)(key) for player, key in zip(self.players, keys, strict=True)]
-        for player, key, state, episode in zip(self.players, keys, states, self.programs(params, states), strict=True):
+        for player, key, state, play in zip(self.players, keys, states, self.programs(params, states), strict=True):
             returns = []
-            for step in range(episodes):
-                state, _, own = episode(params, player.mates, state, jax.random.fold_in(key, step + 1))
+            for step in range(-(-episodes // self.play.episodes)):
+                state, _, own = play(params, player.mates, state, jax.random.fold_in(key, step + 1))
                 returns.append(np.asarray(own, np.float64))
-            found.append(np.stack(returns, axis=-1))
+            found.append(np.concatenate(returns, axis=-1)[:, :episodes])
         return np.concatenate(found)
 
     def programs(self, params: Any, tasks: Sequence[RolloutState]) -> list[Callable[..., Any]]:
-        """Return the compiled episode of each player, for its running tasks.
+        """Return the compiled function `episodes` of each player, for its running tasks.
 
         All players are compiled at the first call, in parallel, since a compilation takes seconds and uses one core.
         """
         if not self._compiled:
             key = jax.random.key(0)
             lowered = [
-                jax.jit(player.episode).lower(params, player.mates, own, key)
+                jax.jit(player.episodes).lower(params, player.mates, own, key)
                 for player, own in zip(self.players, tasks, strict=True)
             ]
             with ThreadPoolExecutor() as pool:

@@ -47,7 +47,7 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """Settings of a method that is trained by playing: one step plays an episode of each of `batch_size` tasks.
+    """Settings of a method that is trained by playing: one step plays `episodes` of each of `batch_size` tasks.
 
     Raises:
         OptionError: if a value is out of bounds.
@@ -58,8 +58,14 @@ class PlayOptions:
     discount: Annotated[Share, Option("Discount of rewards, which continue over a task's episodes.")] = 0.99
     gae_lambda: Annotated[Share, Option("Decay of the advantage estimate's trace.")] = 0.95
     entropy: Annotated[NotNegative, Option("Weight of the entropy bonus.")] = 0.01
-    task_end: Annotated[float, Meta(gt=0, le=1), Option("Chance that a task ends after an episode.")] = 1 / 16
-    imitation: Annotated[NotNegative, Option("Weight of imitating the oracle at the start.")] = 1.0
+    episodes: Annotated[
+        Count, Option("Episodes of each task that a step plays; the model learns to remember over these episodes.")
+    ] = 1
+    task_end: Annotated[float, Meta(gt=0, le=1), Option("Chance that a task ends after a step's episodes.")] = 1 / 16
+    imitation: Annotated[
+        NotNegative,
+        Option("Weight of imitating a script at the start: the oracle, or `search` in tasks with one dish."),
+    ] = 1.0
     imitation_end: Annotated[Positive, Option("Share of the steps at which that weight has fallen to 0.")] = 0.5
     rearranged: Annotated[
         int,

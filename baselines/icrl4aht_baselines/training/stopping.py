@@ -13,7 +13,7 @@ _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class TrainingStopped(SystemExit):
-    """Exit of a training run that a signal stopped, after its state was saved. The code is 128 + the signal's number.
+    """Exit of a process after a signal stopped its training and the state was saved; the code is 128 + signal number.
 
     Args:
         number: number of the signal.

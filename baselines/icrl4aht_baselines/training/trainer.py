@@ -42,12 +42,12 @@ StepProgress = Callable[[int, float | None], None]
 
 
 def format_loss(loss: float | None) -> str:
-    """Return the loss as text for a progress bar; empty for None."""
+    """Return the loss as text for a progress bar; an empty string for None."""
     return "" if loss is None else f"loss {loss:.3f}"
 
 
 def show_steps(show: Callable[..., None], name: str, steps: int) -> StepProgress:
-    """Return a `StepProgress` that shows a progress bar for `steps` steps; `show`: see `progress_bars`."""
+    """Return a `StepProgress` that shows a progress bar for `steps` steps by `show` of `progress_bars`."""
     return lambda step, loss: show(name, step, steps, format_loss(loss))
 
 
@@ -113,8 +113,8 @@ class Trainer:
         self.method, self.options, self._optimizer = method, options, training_optimizer(options)
         self._learning_rate = learning_rate_schedule(options)
         mesh = Mesh(np.asarray(devices), (BATCH_AXIS,))
-        # Data parallelism: each device has the complete state and a share of the rows. XLA averages the gradients over
-        # devices, because the sharding of the result requires equal states.
+        # Data parallelism: each device has the complete state and a share of the rows.
+        # XLA averages the gradients over devices, because the sharding of the result requires equal states.
         self.rows, self._parts, self.everywhere = (
             NamedSharding(mesh, PartitionSpec(*axes)) for axes in ((BATCH_AXIS,), (None, BATCH_AXIS), ())
         )
@@ -172,17 +172,17 @@ class Trainer:
 
         if parts == 1:
             return part_gradient(jnp.int32(0), batch)
-        # A scan stores the activations of one part at a time. All rows have equal weight in the loss, so the mean over
-        # the parts is the gradient of the batch.
+        # A scan stores the activations of one part at a time.
+        # All rows have equal weight in the loss, so the mean of the parts' gradients is the gradient of the batch.
         split = jax.tree.map(split_rows, batch)
         first = jax.tree.map(lambda leaf: leaf[0], split)
         shapes = jax.eval_shape(part_gradient, jnp.int32(0), first)
         zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-        def add(total: Any, numbered: Any) -> tuple[Any, None]:
+        def add_part(total: Any, numbered: Any) -> tuple[Any, None]:
             return jax.tree.map(jnp.add, total, part_gradient(*numbered)), None
 
-        total, _ = jax.lax.scan(add, zero, (jnp.arange(parts), split))
+        total, _ = jax.lax.scan(add_part, zero, (jnp.arange(parts), split))
         return jax.tree.map(lambda leaf: leaf / parts, total)
 
     def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 2) -> Batches:

@@ -31,4 +31,6 @@ class Mean(nn.Module):
         return nn.gelu(self.mix(total / count)), (total, count)
 
 
-mean_ad = action_method("mean_ad", "Mean-AD", lambda options: Mean(options.width))
+def mean_ad(options, world):
+    """Return the method for `ModelOptions` and a `World`."""
+    return action_method("mean_ad", "Mean-AD", options, world, Mean(options.width))

@@ -18,8 +18,10 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.oracle import oracle
+from icrl4aht_generation.experts.search import with_taken_action
 from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.policy import Policy
 
 
 def stream_returns(rewards: np.ndarray) -> np.ndarray:
@@ -130,32 +132,41 @@ def _compiled_greedy(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array
 @lru_cache(maxsize=8)
 def _compiled_oracle(layout: Layout) -> Callable[[jax.Array, jax.Array], jax.Array]:
     """Return a compiled function of state records (100, E, S) and ego actions (100, E) that returns oracle actions."""
-    return jax.jit(lambda records, taken: follow_oracle(layout, records, taken).astype(jnp.int8))
+    return jax.jit(lambda records, taken: follow_script(oracle(layout), layout, records, taken)[0].astype(jnp.int8))
 
 
-def follow_oracle(
-    layout: Layout | Sequence[Layout], records: jax.Array, taken: jax.Array, numbers: jax.Array | None = None
-) -> jax.Array:
-    """Return the actions that the scripted oracle would take in each state of episodes that another ego played.
+def follow_script(
+    script: Policy,
+    layout: Layout | Sequence[Layout],
+    records: jax.Array,
+    taken: jax.Array,
+    numbers: jax.Array | None = None,
+    memory: Any = None,
+) -> tuple[jax.Array, Any]:
+    """Return the actions that a script would take in each state of episodes that another ego played, and its memory.
 
     Args:
+        script: the oracle or the searcher.
         layout: one layout or several.
         records: uint8 (T, E, S), state records of E episodes.
         taken: int (T, E), the actions that the ego took.
         numbers: int (E,), index of each episode's layout; None for one layout.
+        memory: memory of the script before the episodes, leaves (E, ...); by default that before its first episode.
 
     Returns:
-        The oracle's actions, int32 (T, E).
+        The script's actions, int32 (T, E), and its memory after the episodes.
     """
-    env, script = Environment(layout), oracle(layout)
-    keys = jax.random.split(jax.random.key(0), records.shape[1])  # not used by the deterministic oracle
+    env = Environment(layout)
+    keys = jax.random.split(jax.random.key(0), records.shape[1])  # the scripts draw numbers only in their first memory
     zero = jnp.zeros(len(keys), jnp.int32)
 
     def step(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
         record, action = now
         state = EnvState(keys, zero, zero, record, numbers)
         wanted, memory = env.act(script, script.params, memory, state, EGO, keys, own=False)
-        return memory._replace(action=action.astype(jnp.int32)), wanted
+        return with_taken_action(memory, action.astype(jnp.int32)), wanted
 
-    memory = jax.vmap(script.init, in_axes=(None, 0))(script.params, keys)
-    return jax.lax.scan(step, memory, (records, taken))[1]
+    if memory is None:
+        memory = jax.vmap(script.init, in_axes=(None, 0))(script.params, keys)
+    memory, wanted = jax.lax.scan(step, memory, (records, taken))
+    return wanted, memory

@@ -99,7 +99,7 @@ def _update_memory(scene: Scene, last: OracleMemory) -> OracleMemory:
     new, old = scene.state, unpack(scene.tables, last.record)
     same = jnp.all(new.pot_items == old.pot_items) & (new.recipe == old.recipe)
     ego_rests, mate_rests = new.positions[EGO] == old.positions[EGO], new.positions[TEAMMATE] == old.positions[TEAMMATE]
-    bumped = ego_rests & mate_rests & (jnp.asarray(scene.tables.moves)[scene.me, last.action] != scene.me)
+    bumped = ego_rests & mate_rests & (jnp.asarray(scene.tables.moves)[scene.own_cell, last.action] != scene.own_cell)
     # The counters and pots show whether the teammate put its item onto a counter, into a pot or into a goal.
     had = old.hands[TEAMMATE]
     put = (had >> 2 > 0) & (new.hands[TEAMMATE] == 0)
@@ -181,7 +181,7 @@ class OracleView:
     def cost_at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:
         """Return the steps to each of the given pots, plus `then` further steps. All other cells cost NEVER."""
         there = jnp.where(which & self.facts.pots, self.pot_times + then, NEVER)
-        return jnp.where(self.scene.cells_of_kind(POT), self.scene.at(POT, there), NEVER)
+        return jnp.where(self.scene.cells_of_kind(POT), self.scene.values_on_cells(POT, there), NEVER)
 
     @cached_property
     def parking_cost(self) -> Int[Array, " cells"]:
@@ -259,9 +259,9 @@ class OracleView:
 def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> OracleView:
     state, mine = scene.state, jnp.asarray(facts.mine)
     # Obstacle 0 means that the teammate does not block the ego.
-    obstacle = jnp.asarray(facts.obstacle)[scene.partner].astype(jnp.int32)
-    faced = jnp.asarray(scene.tables.ahead)[scene.me, state.facings[EGO].astype(jnp.int32)]
-    items = scene.at(WALL, state.counters)
+    obstacle = jnp.asarray(facts.obstacle)[scene.partner_cell].astype(jnp.int32)
+    faced = jnp.asarray(scene.tables.ahead)[scene.own_cell, state.facings[EGO].astype(jnp.int32)]
+    items = scene.values_on_cells(WALL, state.counters)
     lying = items == jnp.array([[4], [16], [64]], jnp.uint8)
     contents = state.pot_items & np.uint8(0xFF - COOKED)
     full = facts.pots & (ingredient_count(contents) == 3)
@@ -275,7 +275,7 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
         scene,
         memory,
         obstacle,
-        time=jnp.where(scene.cell == faced, 0, _decode_steps(jnp.asarray(facts.ways)[obstacle, scene.me])),
+        time=jnp.where(scene.cells == faced, 0, _decode_steps(jnp.asarray(facts.ways)[obstacle, scene.own_cell])),
         items=items,
         sources=(jnp.asarray(facts.piles) | lying) & mine,
         contents=contents,
@@ -284,7 +284,7 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
         right=full & (contents == state.recipe),
         recipes=recipes,
         stock=cooked + plated + ((scene.partner_hand == recipes | _DISH) & ~memory.parks),
-        missing=scene.counts(recipes) - scene.counts(contents)[:, None],
+        missing=scene.ingredient_counts(recipes) - scene.ingredient_counts(contents)[:, None],
         risky=risky,
         careful=risky & memory.cooks,
         mate_delivers=(scene.partner_hand == state.recipe | _DISH) & ~memory.parks,
@@ -301,12 +301,12 @@ def _first_move(view: OracleView, obstacle: Int[Array, ""] | int, target: Int[Ar
     The action is INTERACT if the ego already faces the target cell.
     """
     scene, ahead = view.scene, jnp.asarray(view.scene.tables.ahead)
-    ends = jnp.asarray(scene.tables.moves)[scene.me, :STAY].astype(jnp.int32)
+    ends = jnp.asarray(scene.tables.moves)[scene.own_cell, :STAY].astype(jnp.int32)
     # The teammate is the obstacle: a move onto its cell only turns the ego.
-    ends = jnp.where((ends == scene.partner) & (obstacle > 0), scene.me, ends)
+    ends = jnp.where((ends == scene.partner_cell) & (obstacle > 0), scene.own_cell, ends)
     after = _decode_steps(jnp.asarray(view.facts.ways)[obstacle, ends, target])
     turn = jnp.argmin(jnp.where(ahead[ends, jnp.asarray(FACING_OF)] == target, 0, after))
-    return jnp.where(ahead[scene.me, scene.state.facings[EGO].astype(jnp.int32)] == target, INTERACT, turn)
+    return jnp.where(ahead[scene.own_cell, scene.state.facings[EGO].astype(jnp.int32)] == target, INTERACT, turn)
 
 
 class Subgoal(NamedTuple):
@@ -340,7 +340,7 @@ def _dish_subgoals(view: OracleView) -> list[Subgoal]:
     scene, facts = view.scene, view.facts
     # A dish on a counter is worth a trip only if the ego can carry it to a goal.
     wanted = (view.items == view.dish) & facts.mine & jnp.any(scene.goals & facts.mine)
-    near = view.cost(scene.empty_counters & facts.shared, scene.manhattan(scene.cell, scene.partner) - view.time)
+    near = view.cost(scene.empty_counters & facts.shared, scene.manhattan(scene.cells, scene.partner_cell) - view.time)
     comes = scene.holds_nothing & (scene.partner_hand == view.dish) & ~jnp.any(facts.pots)
     return [
         # Deliver the current recipe.
@@ -373,7 +373,7 @@ def _plate_subgoals(view: OracleView) -> list[Subgoal]:
 
 
 def _ingredient_subgoals(view: OracleView) -> list[Subgoal]:
-    holds, kind = view.scene.holds_ingredient, view.scene.counts(view.scene.hand) > 0
+    holds, kind = view.scene.holds_ingredient, view.scene.ingredient_counts(view.scene.hand) > 0
     takes = jnp.any((view.missing > 0) & kind, axis=-1)
     # An ingredient for a later recipe goes into a pot only if another pot is left for the current recipe.
     fits = view.plan_costs[:, 0] < NEVER
@@ -408,7 +408,7 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
     missing = view.missing[pot, recipe]
     # Count the teammate's ingredient as already in the pot, unless the pots have not changed for WAIT_LIMIT steps.
     delivering = (scene.partner_hand & PLATE == 0) & (view.memory.calm < WAIT_LIMIT)
-    coming = scene.counts(scene.partner_hand) * delivering
+    coming = scene.ingredient_counts(scene.partner_hand) * delivering
     ingredients = fetch_cost(missing > coming, to_pot[:, pot])
     quick = jnp.sum(missing * jnp.asarray(facts.trip)[pot]) <= WAIT_LIMIT - 4
 
@@ -417,7 +417,9 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
     due = view.timers <= arrival + 2
     right = view.right & ~view.teammate_pots & facts.serves
     wrong = view.full & ~view.right & view.must_clear & facts.serves
-    any_ingredient = fetch_cost(jnp.any(scene.counts(view.recipes) > 0, axis=0), to_pot[:, jnp.argmax(facts.pots)])
+    any_ingredient = fetch_cost(
+        jnp.any(scene.ingredient_counts(view.recipes) > 0, axis=0), to_pot[:, jnp.argmax(facts.pots)]
+    )
     return [
         # Fill up a pot that needs few steps before fetching a plate.
         Subgoal(builds & quick & ~view.risky, ingredients),
@@ -442,8 +444,8 @@ def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Ar
     """Return the action in a shared room, where the ego makes way for the teammate and resolves mutual blocking."""
     scene, facts, still = view.scene, view.facts, view.memory.still
     tables = scene.tables
-    ahead = jnp.asarray(tables.ahead)[scene.partner, scene.state.facings[TEAMMATE].astype(jnp.int32)]
-    pushed = (ahead == scene.me) & (still > 0)
+    ahead = jnp.asarray(tables.ahead)[scene.partner_cell, scene.state.facings[TEAMMATE].astype(jnp.int32)]
+    pushed = (ahead == scene.own_cell) & (still > 0)
     reachable = found & (view.time[target] < FAR)
     # A teammate that blocks the way may leave in this step; if it stays, it may be waiting for the ego.
     follows = found & ~reachable & ~pushed & (still < 3)
@@ -451,12 +453,12 @@ def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Ar
 
     # What the teammate carries shows where it may be going; see `LayoutFacts.hindrance`.
     carries = jnp.where(scene.partner_hand & COOKED > 0, 0, jnp.where(scene.partner_hand > 0, 1, 2))
-    ends = jnp.asarray(tables.moves)[scene.me, : STAY + 1].astype(jnp.int32)
+    ends = jnp.asarray(tables.moves)[scene.own_cell, : STAY + 1].astype(jnp.int32)
     stays = jnp.arange(STAY + 1) == STAY
-    taken = (ends == scene.partner) | ((ends == scene.me) & ~stays) | (stays & pushed)
+    taken = (ends == scene.partner_cell) | ((ends == scene.own_cell) & ~stays) | (stays & pushed)
     faces = jnp.any(jnp.asarray(tables.ahead)[ends] == target, axis=1)
     away = jnp.where(found & ~faces, _decode_steps(jnp.asarray(facts.ways)[0, ends, target]), 0)
-    hindrance = jnp.asarray(facts.hindrance)[carries, scene.partner, ends].astype(jnp.int32)
+    hindrance = jnp.asarray(facts.hindrance)[carries, scene.partner_cell, ends].astype(jnp.int32)
     aside = jnp.argmin(jnp.where(taken, NEVER, hindrance + away - stays))
 
     # With a plate the ego waits in front of the pot; otherwise it steps aside instead of staying.

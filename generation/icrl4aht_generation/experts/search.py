@@ -6,12 +6,16 @@ searcher believes in the dish that best fits the ingredients that the teammate h
 random. The belief changes only while nothing is being cooked. This ego is for tasks that want one dish in all episodes,
 see `Task.recipes`.
 
+The searcher can also advise another ego that acts in its place, so that this ego learns to search. Its belief then also
+follows the dish that the ego has begun, because an unrefused dish is as good a try as the searcher's own.
+
 Shapes: `D` dishes that can be made of the layout's ingredients, `S` bytes of a state record.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.cells import COOKED, GOAL, PLATE
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.state import columns, ingredient_count, possible_recipes, unpack
+from icrl4aht_data.overcooked.state import State, columns, ingredient_count, possible_recipes, unpack
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE, OracleMemory, oracle_params
 from icrl4aht_generation.paths import Scene
 from icrl4aht_generation.policy import Policy, Situation
@@ -54,10 +58,16 @@ class SearchMemory(NamedTuple):
     belief: Int[Array, ""]
 
 
-def searcher(layouts: Layout | Sequence[Layout]) -> Policy:
-    """Return the searcher, a scripted ego, for one layout or for several layouts in the environment's order."""
+def searcher(layouts: Layout | Sequence[Layout], advises: bool = False) -> Policy:
+    """Return the searcher, a scripted ego.
+
+    Args:
+        layouts: one layout, or several layouts in the environment's order.
+        advises: whether another ego acts in the searcher's place.
+    """
     known = [layouts] if isinstance(layouts, Layout) else list(layouts)
-    return SITUATION_SEARCHER._replace(params={"oracle": oracle_params(known), "dishes": padded_dishes(known)})
+    script = _ADVISING_SEARCHER if advises else SITUATION_SEARCHER
+    return script._replace(params={"oracle": oracle_params(known), "dishes": padded_dishes(known)})
 
 
 def padded_dishes(layouts: Sequence[Layout]) -> np.ndarray:
@@ -84,9 +94,11 @@ def _initial_memory(params: Any, key: Key[Array, ""]) -> SearchMemory:
     return SearchMemory(SITUATION_ORACLE.init(params["oracle"], key), order, no, no, seen, order.argmax())
 
 
-def _act(params: Any, memory: SearchMemory, view: Situation, key: Key[Array, ""]) -> tuple[Int[Array, ""], Any]:
+def _act(
+    params: Any, memory: SearchMemory, view: Situation, key: Key[Array, ""], advises: bool = False
+) -> tuple[Int[Array, ""], Any]:
     dishes = jnp.asarray(params["dishes"])[view.layout]
-    memory = _update_belief(memory, view, dishes)
+    memory = _update_belief(memory, view, dishes, advises)
     believed = dishes[memory.belief]
     facts, blank = params["oracle"]
     facts = facts._replace(recipes=jnp.full_like(jnp.asarray(facts.recipes), believed))
@@ -98,8 +110,10 @@ def _act(params: Any, memory: SearchMemory, view: Situation, key: Key[Array, ""]
 SITUATION_SEARCHER = Policy((), _initial_memory, _act, "situation")
 """The searcher for any layouts; the `params` to set are `oracle_params` and `padded_dishes` of the layouts."""
 
+_ADVISING_SEARCHER = Policy((), _initial_memory, partial(_act, advises=True), "situation")
 
-def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"]) -> SearchMemory:
+
+def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"], advises: bool) -> SearchMemory:
     """Return the memory updated by the outcome of the previous step."""
     new, old = unpack(view.tables, view.record), unpack(view.tables, memory.oracle.record)
     # `follows` is False at an episode's first step, because new starts are rarely one move from the last positions.
@@ -117,10 +131,23 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
     had = old.hands[TEAMMATE]
     into_pot = jnp.sum(ingredient_count(new.pot_items)) > jnp.sum(ingredient_count(old.pot_items))
     put = (had >> 2 > 0) & (had & PLATE == 0) & (new.hands[TEAMMATE] == 0) & into_pot
-    seen = memory.seen + jnp.where(put, Scene.counts(had), 0)
-    fits = (Scene.counts(dishes) @ seen) / jnp.maximum(seen.sum(), 1)
+    seen = memory.seen + jnp.where(put, Scene.ingredient_counts(had), 0)
+    fits = (Scene.ingredient_counts(dishes) @ seen) / jnp.maximum(seen.sum(), 1)
     score = jnp.where(paid, 100.0, fits + 0.1 * memory.order) - 1000.0 * (refused | (dishes == _NO_DISH))
     idle = jnp.all(new.pot_items == 0) & (new.hands[EGO] == 0)
     change = idle | refused[memory.belief] | paid.any()
+    if advises:
+        fitting = jnp.all(Scene.counts(dishes) >= _begun_dish(new), axis=-1)
+        score = score - 50.0 * ~fitting  # counts more than the teammate's hints, and less than what was paid or refused
+        change |= ~fitting[memory.belief]
     belief = jnp.where(change, score.argmax(), memory.belief)
     return memory._replace(paid=paid, refused=refused, seen=seen, belief=belief)
+
+
+def _begun_dish(state: State) -> Int[Array, " 3"]:
+    """Return the pieces of each ingredient in the dish that the ego carries, or in the fullest pot and in its hand."""
+    hand, counts = state.hands[EGO], ingredient_count(state.pot_items)
+    in_hand = Scene.counts(hand & np.uint8(0xFF - COOKED))
+    in_pot = Scene.counts(state.pot_items[jnp.argmax(counts)] & np.uint8(0xFF - COOKED))
+    adds = (hand & PLATE == 0) & (counts.max() < 3)
+    return jnp.where(hand & COOKED > 0, in_hand, in_pot + jnp.where(adds, in_hand, 0))

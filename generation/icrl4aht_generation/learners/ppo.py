@@ -95,7 +95,7 @@ def sequences(
     """
     agent, env = np.divmod(agent_slots, rollout.done.shape[1])
     choice = rollout.choices[player]
-    # Two button presses cost less than a wrong delivery, so the team's reward reveals a wrong delivery.
+    # A wrong delivery costs more than two button presses, so a reward below two presses means a wrong delivery.
     shaped = rollout.shaped[:, env, agent] + forgiveness * (rollout.reward[:, env] < 2 * PRESS_REWARD)
     return Sequences(
         seen=view(slot_records(rollout.record, agent_slots)),
@@ -155,7 +155,7 @@ class PPO:
         """
         config, adam = self.config, ppo_optimizer(self.config)
         count = played.done.shape[1] - played.done.shape[1] % config.minibatches
-        # Advantages and targets use the values of the rollout, so they are fixed over the epochs.
+        # Advantages and critic targets use the values from the rollout, so they do not change between epochs.
         advantage = generalised_advantage(played.reward, played.value, played.done, played.last_value[0], config)
         batch = Batch(played, advantage, advantage + played.value)
 
@@ -186,11 +186,11 @@ class PPO:
         log_probs = jax.nn.log_softmax(logits)
         log_prob = jnp.take_along_axis(log_probs, played.action[..., None], axis=-1)[..., 0]
         ratio = jnp.exp(log_prob - played.log_prob)
-        # The weights are applied after the normalization, which would otherwise cancel them.
+        # Apply the weights after the advantages are normalized, because normalization would cancel earlier weights.
         advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8) * played.weight
         clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
         policy = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
-        # Use the larger of both errors: clipping must not hide a value that moved in the wrong direction.
+        # Use the larger error, because clipping alone would hide a value that moved in the wrong direction.
         near = played.value + jnp.clip(value - played.value, -config.clip, config.clip)
         error = jnp.maximum((value - batch.target) ** 2, (near - batch.target) ** 2)
         value_loss = 0.5 * error.mean()
@@ -233,12 +233,12 @@ def generalised_advantage(
     continues = 1.0 - done
     delta = reward + config.discount * following * continues - value
 
-    def step_back(trace, inputs):
+    def accumulate_trace(trace, inputs):
         delta, continues = inputs
         trace = delta + config.discount * config.gae_lambda * continues * trace
         return trace, trace
 
-    return jax.lax.scan(step_back, jnp.zeros_like(last_value), (delta, continues), reverse=True)[1]
+    return jax.lax.scan(accumulate_trace, jnp.zeros_like(last_value), (delta, continues), reverse=True)[1]
 
 
 def episode_metrics(rollout: Rollout) -> dict[str, Array]:

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from filelock import Timeout
 from flax.traverse_util import flatten_dict
-from jax._src.xla_bridge import backends_are_initialized  # JAX has no public function for this
+from jax._src.xla_bridge import backends_are_initialized  # private, because JAX has no public equivalent
 from jax.experimental import multihost_utils
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as to_bytes
@@ -38,11 +38,11 @@ _SUFFIX = ".safetensors"
 
 
 class BusyError(OptionError):
-    """Error: another process is using the folder."""
+    """Raised when another process is using the folder of a training run."""
 
 
 class OtherSettingsError(OptionError):
-    """Error: the saved state belongs to other settings."""
+    """Raised when a saved state belongs to a training run with other settings."""
 
 
 def xla_threads() -> int | None:
@@ -177,7 +177,7 @@ class StateFile:
                 raise ValueError(f"format {metadata['format']!r}, expected {_FORMAT!r}")
             settings, progress = json.loads(metadata["settings"]), int(metadata["progress"])
         except (SafetensorError, KeyError, ValueError) as error:
-            raise self._unreadable(repr(error)) from error
+            raise self._unreadable_error(repr(error)) from error
         different = {} if self.settings is None else differing_settings(settings, self.settings)
         for name, (found, expected) in different.items():
             resume = f"set {_XLA_THREADS[0]}={found} to resume it, " if name == "xla_threads" and found else ""
@@ -211,26 +211,26 @@ class StateFile:
             OptionError: if the file is missing or damaged, or contains other arrays.
         """
         if self.progress is None:
-            raise self._unreadable("no such file")
+            raise self._unreadable_error("no such file")
         wanted = _named_leaves(like, part)
         try:
             with safe_open(self.path, "numpy") as file:
                 names = [name for name in file.keys() if not part or f"{name}/".startswith(f"{part}/")]  # noqa: SIM118
                 saved = {name: file.get_tensor(name) for name in names}
         except SafetensorError as error:
-            raise self._unreadable(str(error)) from error
+            raise self._unreadable_error(str(error)) from error
         expected = {name: _shape_text(leaf) for name, leaf in wanted.items()}
         found = {name: _shape_text(array) for name, array in saved.items()}
         # Report only the first difference, because a state of another network differs in most arrays.
         for name in sorted(expected.keys() | found.keys()):
             if expected.get(name) != found.get(name):
-                raise self._unreadable(
+                raise self._unreadable_error(
                     f"{name}: expected {expected.get(name, 'nothing')}, found {found.get(name, 'nothing')}"
                 )
         leaves = [_with_sharding(saved[name], leaf) for name, leaf in wanted.items()]
         return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
-    def _unreadable(self, problem: str) -> OptionError:
+    def _unreadable_error(self, problem: str) -> OptionError:
         return OptionError(f"{self.path}: not a state of this training: {problem}; remove the file to start again")
 
 
@@ -248,7 +248,7 @@ class Checkpoints:
 
     @property
     def steps(self) -> list[int]:
-        """Steps of the checkpoints, ascending."""
+        """Steps at which checkpoints were saved, ascending."""
         return sorted(int(path.stem) for path in self.folder.glob(f"*{_SUFFIX}") if path.stem.isdecimal())
 
     @property
@@ -256,27 +256,27 @@ class Checkpoints:
         """Step of the last checkpoint; None if no checkpoint exists."""
         return max(self.steps, default=None)
 
-    def at(self, step: int) -> StateFile:
-        """Return the state file of the checkpoint of a step."""
+    def state_file(self, step: int) -> StateFile:
+        """Return the state file of the checkpoint at a step."""
         return StateFile(self.folder / f"{step}{_SUFFIX}", self.settings)
 
     def save(self, state: Any, step: int) -> None:
-        """Write a checkpoint, then remove the oldest checkpoints."""
-        self.at(step).save(state, step)
+        """Write a checkpoint, then remove all but the latest `keep` checkpoints."""
+        self.state_file(step).save(state, step)
         if jax.process_index() == 0:
             for old in self.steps[: -self.keep]:
-                self.at(old).path.unlink()
+                self.state_file(old).path.unlink()
 
     def load(self, like: Any, part: str = "") -> tuple[Any, int]:
         """Return the state of the last checkpoint, or a part of the state, and the step; see `StateFile.load`.
 
         Raises:
-            OptionError: if no checkpoint exists, or `StateFile.load` raises this error.
+            OptionError: if no checkpoint exists, or the last checkpoint cannot be loaded.
         """
         step = self.latest
         if step is None:
             raise OptionError(f"{self.folder}: no checkpoint yet; continue the training with the same command")
-        return self.at(step).load(like, part), step
+        return self.state_file(step).load(like, part), step
 
 
 class RunLog:
@@ -308,14 +308,14 @@ class RunLog:
             file.flush()
 
     def sync(self) -> None:
-        """Flush the metrics to the disk; call this before saving the state of these updates."""
+        """Flush the metrics to the disk; call this before saving the state after the logged updates."""
         if self._writes:
             os.fsync(self._metrics.fileno())
 
     def close(self) -> None:
-        """Close both files."""
+        """Close the files of the metrics and the timing."""
         for file in (self._metrics, self._timing):
-            with suppress(OSError):  # `write` flushes, so this error was already raised there
+            with suppress(OSError):  # `write` has already raised the error of a failed flush
                 file.close()
 
 
@@ -338,14 +338,16 @@ def _named_leaves(tree: Any, part: str = "") -> dict[str, Any]:
     names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in leaves]
     named = {"/".join(filter(None, (part, name))): leaf for name, (_, leaf) in zip(names, leaves, strict=True)}
     if len(named) < len(leaves):
-        raise ValueError("two leaves of the state have the same path")
+        raise ValueError(
+            f"{len(leaves)} leaves of the state, but {len(named)} different paths: give every leaf its own path"
+        )
     return named
 
 
 def _file_bytes(arrays: dict[str, np.ndarray], metadata: dict[str, str]) -> bytes:
-    """Return the bytes of a safetensors file, which depend only on the content."""
-    # The library writes metadata in a random order, so this adds metadata to the header of a file without any.
-    # Not `save_file`, which does not raise an OSError for a full disk.
+    """Return arrays and metadata as the bytes of a safetensors file; equal content gives equal bytes."""
+    # The library writes metadata in a random order, so metadata is added below to a file without metadata.
+    # `save_file` is not used, because it does not raise an OSError for a full disk.
     content = to_bytes(arrays)
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.dumps({"__metadata__": metadata} | json.loads(content[8:end]), separators=(",", ":")).encode()
@@ -364,7 +366,7 @@ def _shape_text(leaf: Any) -> str:
 
 def _host_array(leaf: Any) -> np.ndarray:
     data = jax.random.key_data(leaf) if _is_key(leaf) else leaf
-    # Parts on devices of other processes must be gathered by all processes together.
+    # If parts of the array are on devices of other processes, all processes must gather it together.
     if isinstance(data, jax.Array) and not (data.is_fully_addressable or data.is_fully_replicated):
         data = multihost_utils.process_allgather(data, tiled=True)
     return np.require(np.asarray(data), requirements="C")

@@ -67,7 +67,7 @@ class RolloutCarry(NamedTuple):
 
 
 class Rollout(NamedTuple):
-    """Recorded T steps of N environments.
+    """T recorded steps of N environments.
 
     Attributes:
         record: uint8 (T, N, S), state records before each step.
@@ -153,7 +153,7 @@ def roll_out(
 def select_rows(which: Bool[Array, " N"], one: Any, other: Any) -> Any:
     """Return a pytree with rows (axis 0) of `one` where `which` is true, and rows of `other` elsewhere."""
 
-    def select(a: Array, b: Array) -> Array:  # leaves may be typed keys
+    def select(a: Array, b: Array) -> Array:  # `a` and `b` may be typed JAX keys
         return jnp.where(which.reshape(which.shape + (1,) * (a.ndim - 1)), a, b)
 
     return jax.tree.map(select, one, other)
@@ -249,7 +249,7 @@ def slot_records(record: UInt8[Array, "*B N S"], agent_slots: np.ndarray) -> UIn
     """
     n = record.shape[-2]
     agent, env = np.divmod(agent_slots, n)
-    if not agent.any():  # ordered slots of the ego need no gather
+    if not agent.any():  # the egos of all environments in order need no indexing
         return record if np.array_equal(env, np.arange(n)) else record[..., env, :]
     own = record[..., env, :]
     return jnp.where((agent == 1)[:, None], swap_agents(own), own)

@@ -166,7 +166,7 @@ def forward_seconds(layout: Layout, config: PPOConfig) -> float:
     network = ActorCritic(config.widths, view=view)
     shapes = jax.eval_shape(lambda key: network.untrained(key, layout.channels), jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    # All environments have equal records, because most observations in training are equal, which the encoder exploits.
+    # Equal records imitate training, where most observations are equal and the encoder computes each only once.
     record = np.random.default_rng(0).integers(0, 256, (steps, 1, record_size(layout)), np.uint8)
     records = jnp.asarray(np.repeat(record, count, axis=1))
     reset = jnp.zeros((steps, count), bool)

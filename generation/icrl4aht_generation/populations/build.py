@@ -44,7 +44,7 @@ from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.references import REFERENCE_EGOS, stacked_families
 from icrl4aht_generation.teammates.registry import build_teammate
 
-_EPISODES = 2  # number of episodes with each policy for the compared states
+_EPISODES = 2  # number of episodes with each policy that provide the compared states
 
 
 def build_suite(
@@ -203,7 +203,7 @@ def family_distances(distances: np.ndarray, families: Mapping[str, Sequence[int]
 
 
 def _visited_records(env: Environment, numbers: list[int], family: Policy, key: Any) -> jax.Array:
-    """Return state records, uint8 (T, policies x 2, S), of a random ego with each policy of a family."""
+    """Return state records, uint8 (T, policies x 2, S), from episodes of a random ego with each policy of a family."""
     n = len(numbers) * _EPISODES
 
     @jax.jit

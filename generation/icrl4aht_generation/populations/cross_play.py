@@ -1,4 +1,4 @@
-"""Returns of learned policies with each other over complete training episodes, in one compiled rollout."""
+"""Cross-play of learned policies: mean returns of pairs over complete training episodes in one compiled rollout."""
 
 from __future__ import annotations
 

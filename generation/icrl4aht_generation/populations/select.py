@@ -96,7 +96,10 @@ def make_tasks(suite: Path, selections: Sequence[TeammateSelection], split: str)
 
 
 def write_manifests(suite: Path, selections: Sequence[TeammateSelection]) -> list[Path]:
-    """Write and return SUITE/manifests/<track>_train.jsonl and _heldout.jsonl for all tracks with teammates."""
+    """Write manifests for all tracks that have teammates, and return their paths.
+
+    The files are SUITE/manifests/<track>_train.jsonl and SUITE/manifests/<track>_heldout.jsonl.
+    """
     folder = suite / "manifests"
     folder.mkdir(parents=True, exist_ok=True)
     written = []

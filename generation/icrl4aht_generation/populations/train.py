@@ -269,14 +269,14 @@ class _PopulationTraining:
                 shutil.rmtree(folder, ignore_errors=True)
             return 0, None
         stage = (done - 1) // self.run.config.updates
-        return done, self.saved.load(jax.eval_shape(self.run.stages[stage].init, self._key(stage)))
+        return done, self.saved.load(jax.eval_shape(self.run.stages[stage].init, self._stage_key(stage)))
 
-    def _key(self, stage: int):
+    def _stage_key(self, stage: int):
         return jax.random.fold_in(jax.random.key(self.run.seed), stage)
 
     def _train_stage(self, stage: int, resumed: PopulationState | None, log: RunLog) -> None:
         population, updates = self.run.stages[stage], self.run.config.updates
-        state: PopulationState = resumed or jax.jit(population.init)(self._key(stage))
+        state: PopulationState = resumed or jax.jit(population.init)(self._stage_key(stage))
         moments = checkpoint_updates(self.run.config)
         started, first = time.perf_counter(), int(state.update)
         for number in range(first, updates):
@@ -319,7 +319,7 @@ class _PopulationTraining:
         last = POLICY_CHECKPOINTS - 1
         former = stacked([load_policy(self.folder / f"m{m}" / f"c{last}")[1] for m in range(stage)])
         new = jax.tree.map(lambda leaf: leaf[:1], params)
-        # Add the returns of both orders of the agents, because layouts are not symmetric.
+        # Add the returns with the two policies in either order, because layouts are not symmetric.
         returns = cross_play_returns(layout, network, new, former, seed=number)[0]
         returns = returns + cross_play_returns(layout, network, former, new, seed=number)[:, 0]
         nearest = int(np.argmax(returns))

@@ -26,7 +26,7 @@ FOLDER = Path(__file__).parent
 Value = TypeVar("Value")
 Config = TypeVar("Config", PPOConfig, NoiseConfig)
 _Names = tuple[str, ...]
-_Return = Annotated[float, Meta(ge=-1e6, le=1e6)]  # a finite number
+_Return = Annotated[float, Meta(ge=-1e6, le=1e6)]  # bounds that exclude infinity
 
 
 class _Release(Struct, forbid_unknown_fields=True):
@@ -100,7 +100,7 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
 
     Args:
         name: name of a shipped profile, or path of a TOML file.
-        prepare: called with the profile before its teammates are drawn, which initializes JAX.
+        prepare: called with the profile before its teammates are drawn, because drawing teammates initializes JAX.
 
     Raises:
         UnknownNameError: if neither a shipped profile nor a TOML file has the name.
@@ -179,7 +179,7 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
         name=name,
         ego=ego,
         ego_layouts=ego_layouts,
-        teammates=_teammates(content.teammates),
+        teammates=_teammate_config(content.teammates),
         noise=noise,
         search=search,
         scripted_layouts={"noise": noise_layouts, "search": search_layouts},
@@ -202,7 +202,7 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
 def _read_section(
     name: str, values: dict[str, Any], default: Config, layouts: tuple[str, ...]
 ) -> tuple[Config, dict[str, Config]]:
-    """Return the settings of a section, and the settings by layout for layouts in the section's table `layouts`."""
+    """Return the settings of a section, and the settings of each layout in the section's table `layouts`."""
     common = replace_options(default, {key: value for key, value in values.items() if key != "layouts"}, f"{name}.")
     own = _by_layout(f"{name}.layouts", values.get("layouts", {}), layouts)
     return common, {each: replace_options(common, of, f"{name}.layouts.{each}.") for each, of in own.items()}
@@ -265,7 +265,7 @@ def _teammate_key(work: Work) -> tuple[Any, ...]:
     return work.task.layout.name, work.task.recipes, teammate_id(work.task.teammate)
 
 
-def _teammates(values: dict[str, Any]) -> TeammateConfig:
+def _teammate_config(values: dict[str, Any]) -> TeammateConfig:
     """Split the section [teammates] into sizes of the suite and hyper-parameters of the policies."""
     sizes = {name: values[name] for name in ("members", "train", "heldout") if name in values}
     rest = {name: value for name, value in values.items() if name not in sizes}

@@ -47,7 +47,7 @@ class NoiseConfig:
     def __post_init__(self) -> None:
         for name in ("start", "end", "begin", "finish", "power"):
             value = getattr(self, name)
-            if isinstance(value, int | float):  # a range of one value
+            if isinstance(value, int | float):  # a single number is a range of one value
                 object.__setattr__(self, name, (value, value))
         check_options(self)
         for name in ("start", "end", "begin", "finish", "power"):
@@ -56,9 +56,11 @@ class NoiseConfig:
             if low > high:
                 raise OptionError(f"{name} = {[low, high]}: expected a range [low, high]")
         if self.begin[1] > self.finish[0]:
-            raise OptionError(f"begin = {list(self.begin)}: expected values up to finish = {list(self.finish)}")
+            raise OptionError(
+                f"begin = {list(self.begin)}: expected at most the values of finish = {list(self.finish)}"
+            )
         if self.start[0] < self.end[1]:
-            raise OptionError(f"start = {list(self.start)}: expected no value below the range end = {list(self.end)}")
+            raise OptionError(f"start = {list(self.start)}: expected at least the values of end = {list(self.end)}")
 
 
 SEARCH = NoiseConfig(start=(0.0, 0.2), begin=(1.0, 1.0))

@@ -93,7 +93,7 @@ class SpreadConfig:
 
     Attributes:
         per_layout: number of training teammates by layout; the source "noise" uses all of them.
-        ppo: number of training teammates by layout that the source "ppo" uses, the first of the list.
+        ppo: number of training teammates by layout that the source "ppo" uses, the first in the list.
         validation: number of validation teammates by layout, which only the source "noise" uses.
     """
 
@@ -101,18 +101,18 @@ class SpreadConfig:
     ppo: dict[str, int]
     validation: dict[str, int]
 
-    def drawn(self, layout: str, source: str) -> list[tuple[str, dict[str, Any]]]:
-        """Return the teammates of a source on a layout, and the splits of their tasks.
+    def teammates_of(self, layout: str, source: str) -> list[tuple[str, dict[str, Any]]]:
+        """Return pairs (split of the task, teammate entry) of a source on a layout.
 
         Raises:
             OptionError: if too few measured teammates of the layout differ from the test teammates.
         """
         count = self.ppo[layout] if source == "ppo" else None
-        found = [("train", entry) for entry in self._entries(layout, "train", self.per_layout[layout])[:count]]
-        validation = self._entries(layout, "validation", self.validation[layout])
+        found = [("train", entry) for entry in self._split_entries(layout, "train", self.per_layout[layout])[:count]]
+        validation = self._split_entries(layout, "validation", self.validation[layout])
         return found + [("validation", entry) for entry in validation if source == "noise"]
 
-    def _entries(self, layout: str, split: str, count: int) -> list[dict[str, Any]]:
+    def _split_entries(self, layout: str, split: str, count: int) -> list[dict[str, Any]]:
         return spread_teammates(layout, split, count)
 
 
@@ -126,7 +126,7 @@ class SampledConfig(SpreadConfig):
 
     families: dict[str, tuple[str, ...]]
 
-    def _entries(self, layout: str, split: str, count: int) -> list[dict[str, Any]]:
+    def _split_entries(self, layout: str, split: str, count: int) -> list[dict[str, Any]]:
         seed = VALIDATION_DRAWS if split == "validation" else 0
         return [entry for entry, _ in drawn_teammates(layout, self.families[layout], count, seed)]
 
@@ -299,7 +299,9 @@ class Profile:
                 make_task(track, split, layout, entry, first + number)
                 for number, entry in enumerate(_generated_teammates(layout, split, self.generated))
             ]
-        entries = [drawn for config in (self.sampled, self.spread) if config for drawn in config.drawn(layout, source)]
+        entries = [
+            pair for config in (self.sampled, self.spread) if config for pair in config.teammates_of(layout, source)
+        ]
         return tasks + [
             make_task(track, split, layout, entry, _sampled_seed(layout, source, entry)) for split, entry in entries
         ]
@@ -311,7 +313,7 @@ class Profile:
 
 
 def _generated_teammates(layout: str, split: str, generated: Mapping[str, int]) -> list[dict[str, Any]]:
-    """Return the sampled teammates of a generated layout; all generated layouts together cycle through the families."""
+    """Return the sampled teammates of a generated layout; the families take turns over all generated layouts."""
     first, kinds = sum(generated[name] for name in takewhile(layout.__ne__, generated)), list(HEURISTIC_KINDS)
     return [
         sample_teammate(kinds[number % len(kinds)], number // len(kinds), "diverse", _GENERATED_DRAWS[split])

@@ -1,1 +1,1 @@
-"""Releases that are packed from generated histories."""
+"""Packing of generated histories into releases, and comparison of releases."""

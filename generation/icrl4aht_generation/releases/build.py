@@ -66,7 +66,7 @@ def build_releases(
         OptionError: if `out` has files that this function does not write, if out/<kind> is not a release of this
             profile, or if matplotlib is not installed.
     """
-    check_can_draw()  # raise this error before the long training, not after it
+    check_can_draw()  # fail before the long training if matplotlib is missing
     for kind in kinds:
         check_release_folder(out / kind, profile)
     options = options or QueueOptions()
@@ -82,7 +82,7 @@ def build_releases(
     run_jobs(jobs, out, console, options)
     tasks = list({work.task.task_id: work.task for work in units}.values())
     artefacts, releases = out / "artefacts", [out / kind for kind in kinds]
-    with process_lock(out / _PACKING_LOCK):  # another process with this folder packs the same releases
+    with process_lock(out / _PACKING_LOCK):  # other processes may pack the same releases
         facts = teammate_facts(tasks, artefacts, suite, headroom)
         for kind, release in zip(kinds, releases, strict=True):
             with progress_bars(unit="tasks") as show:
@@ -125,7 +125,7 @@ def train_teammates(
             left_out.append(LeftOutTask(task.task_id, task.layout.name, name, work.source, 0, 0, None, None, reason))
     if not units and left_out:
         raise FailedJobsError(
-            f"{suite}: no reference ego earns more than another with any learned teammate: train other teammates, or "
+            f"{suite}: all reference egos earn about the same with each learned teammate: train other teammates, or "
             f"add sampled heuristics ([tasks.sampled]) to profile {profile.name}"
         )
     if not units:

@@ -1,9 +1,9 @@
 """Choose the ego checkpoint that labels a task's histories, by returns with the task's teammate.
 
-The labeller is the last checkpoint, as in the paper, unless an earlier checkpoint earns clearly more with greedy
-actions, as in the labels. A policy that was trained with random actions can get stuck in "stay" when it acts greedily,
-and a model would learn this from the labels. If a task has several independent learners, the learner with the best
-labeller labels the histories of all learners.
+The labels are greedy actions. The labeller is the last checkpoint, as in the paper, unless an earlier checkpoint earns
+clearly more with greedy actions. A policy that was trained with random actions can get stuck in "stay" when it acts
+greedily, and a model would learn this from the labels. If a task has several independent learners, the learner with the
+best labeller labels the histories of all learners.
 """
 
 from __future__ import annotations
@@ -111,8 +111,8 @@ def learner_labeller(folder: Path, task: Task, suite: Path) -> tuple[Path, Exper
 def choose_checkpoint(returns: np.ndarray) -> int:
     """Return the number of the labelling checkpoint: the last checkpoint, or the best that earns clearly more.
 
-    An earlier checkpoint earns clearly more if its mean difference to the last checkpoint in equal episodes is at least
-    2 (a delivery is worth 20) and above two standard errors of this mean.
+    An earlier checkpoint earns clearly more if its mean difference to the last checkpoint in the same episodes is at
+    least 2 (a delivery is worth 20) and above two standard errors of this mean.
 
     Args:
         returns: (C, E), greedy returns of C checkpoints in the same E episodes.
@@ -122,7 +122,7 @@ def choose_checkpoint(returns: np.ndarray) -> int:
     errors = differences.std(axis=1, ddof=1) / np.sqrt(returns.shape[1])
     clearly = (means >= _LEAST_GAIN) & (means > _STANDARD_ERRORS * errors)
     best = np.where(clearly, means, -np.inf)
-    # The latest of equally good checkpoints, and so the last checkpoint if no other is clearly better.
+    # Ties go to the later checkpoint, so the last checkpoint is chosen if no other is clearly better.
     return len(best) - 1 - int(np.argmax(best[::-1]))
 
 

@@ -153,7 +153,7 @@ def cached_measurement(path: Path, settings: dict[str, Any], kind: type[T], meas
         path: path of the file.
         settings: settings that the measurements depend on.
         kind: type of the measurements, which msgspec validates.
-        measure: function that measures.
+        measure: function that returns new measurements.
     """
     try:
         content = msgspec.json.decode(read_text(path))  # unlike `json`, msgspec refuses NaN

@@ -192,7 +192,7 @@ def check_release_folder(target: Path, profile: Profile) -> None:
     """Check that `target` does not exist, or is an unchanged release that was generated with this profile.
 
     Raises:
-        OptionError: if `target` is anything else.
+        OptionError: if `target` exists and is not an unchanged release of this profile.
     """
     if not check_target(target, overwrite=True):
         return
@@ -217,7 +217,9 @@ def recorded_sources(release: Path) -> dict[str, str]:
     return {task_id: made.source or "ppo" for task_id, made in release_provenance(release).items()}
 
 
-def _populations(task: Task, profile: Profile, suite: Path, recorded: Mapping[str, Provenance]) -> TeammateSuite | None:
+def _population_record(
+    task: Task, profile: Profile, suite: Path, recorded: Mapping[str, Provenance]
+) -> TeammateSuite | None:
     """Return the record of a learned teammate's populations, from the profile or from the teammate's release."""
     if task.task_id in recorded:
         return recorded[task.task_id].suite
@@ -255,15 +257,15 @@ def _new_task(
         teammate={"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
         streams_recorded=len(found.recorded_returns),
         streams_kept=len(found.kept_returns),
-        suite=_populations(task, profile, suite, recorded) if task.teammate_family == "rl" else None,
+        suite=_population_record(task, profile, suite, recorded) if task.teammate_family == "rl" else None,
         expert=expert,
         **own,
     )
-    # Store the oracle's actions if they are worth learning, or if the oracle also gives the labels.
+    # Store the oracle's actions if the oracle earns at least the histories' final return, or gives the labels.
     with_oracle = profile.oracle_actions and made.is_oracle_useful(float(curve_ends(found.kept_returns)[1].mean()))
 
     def load() -> Iterator[NewHistory]:
-        label = _labels(found, labeller)
+        label = _label_function(found, labeller)
         for learner, stream, arrays in _recorded_histories(found):
             labels = {"expert_actions": label(stream, arrays["state"])}
             if with_oracle and found.source == "noise":
@@ -283,7 +285,7 @@ def _script_labels(source: str, references: ReferenceEgos) -> ExpertLabels:
     return ExpertLabels(None, "scripted searcher, which sees the full state but not which dish is wanted", view="state")
 
 
-def _labels(found: TaskHistories, labeller: Path | None) -> Callable[[int, np.ndarray], np.ndarray]:
+def _label_function(found: TaskHistories, labeller: Path | None) -> Callable[[int, np.ndarray], np.ndarray]:
     """Return a function of a stream's number and states, uint8 (T, S), that returns expert actions, int8 (T,)."""
     if labeller is None:
         script = np.load(found.folders[0] / "script_actions.npy", mmap_mode="r")

@@ -123,7 +123,7 @@ def common_states(layout: Layout, episodes: int = _EPISODES) -> tuple[UInt8[Arra
 
 
 def instance_policies(layout: Layout) -> list[Policy]:
-    """Return the test instances that test models trained on a layout, by family and number, which see a `Situation`."""
+    """Return the test instances for models trained on a layout, by family and number; they see a `Situation`."""
     tested = TESTED_ON.get(layout.name, layout.name)
     entries = [entry for family in TESTED_FAMILIES for entry in published_teammates(tested, family)]
     return [build_teammate(None, entry) for entry in entries]

@@ -96,10 +96,10 @@ class Draw(Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def admissible(self) -> bool:
         """Whether the draw behaves differently from all test instances of its family (of all families if diverse)."""
-        return self.nearest_counted[0] >= _least_distance(self.base_seed)
+        return self.nearest_compared[0] >= _least_distance(self.base_seed)
 
     @property
-    def nearest_counted(self) -> tuple[float, str]:
+    def nearest_compared(self) -> tuple[float, str]:
         """Distance and name of the test instance with the most similar behaviour, which `admissible` depends on.
 
         Only test instances of the same family count, or those of all families for a diverse draw.
@@ -166,8 +166,9 @@ def drawn_teammates(
     available = sum(map(len, queues))
     if count > available:
         raise OptionError(
-            f"{name}: {count} {_OF_SEED[base_seed]} teammates requested of {', '.join(families) or 'no family'}, with "
-            f"only {available} distinct draws; request fewer or name more families ({_usable_text(name, base_seed)})"
+            f"{name}: {count} {_OF_SEED[base_seed]} teammates requested from {', '.join(families) or 'no family'}, "
+            f"expected at most {available}, the number of distinct draws; request fewer, or name more families "
+            f"({_usable_text(name, base_seed)})"
         )
     turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]
     ranges = ranges_of(base_seed)
@@ -233,7 +234,7 @@ def _ordered_draws(layout: str, family: str, base_seed: int) -> list[Draw]:
     """
     draws = _usable(layout, family, base_seed)
     if not draws:
-        farthest = max((draw.nearest_counted for draw in read_draws(layout, family, base_seed)), default=None)
+        farthest = max((draw.nearest_compared for draw in read_draws(layout, family, base_seed)), default=None)
         near = f", to {farthest[1]}" if farthest else ""
         raise OptionError(
             f"{layout}: no usable {_OF_SEED[base_seed]} teammates of {family}: "
@@ -268,7 +269,7 @@ def unusable_reason(layout: str, family: str, base_seed: int = 0) -> str:
         return "no draws were measured; `icrl4aht-data research draws` measures them"
     admissible = [draw for draw in draws if draw.admissible]
     if not admissible:
-        farthest = max(draw.nearest_counted[0] for draw in draws)
+        farthest = max(draw.nearest_compared[0] for draw in draws)
         tests = "a test teammate" if base_seed in _DIVERSE_SEEDS.values() else "a test teammate of the family"
         return f"all {len(draws)} draws act like {tests} (distance {farthest:.3f} at most)"
     widest = max(draw.spread for draw in admissible)

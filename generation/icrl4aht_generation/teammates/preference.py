@@ -64,14 +64,14 @@ def _dishes_and_teammates(layout: Layout, split: str, number: int, part: str) ->
         yield from ((dish, mates[(3 * k + number) % len(mates)]) for k, dish in enumerate(dishes * 4))
         return
     for k in range(_TEST_TASKS[part] if split == "test" else len(TESTED_FAMILIES)):
-        # The two factors differ, so over all layouts every dish occurs with teammates of several families.
+        # The factors of `number` differ, so over all layouts every dish occurs with teammates of several families.
         yield dishes[(3 * k + 7 * number) % len(dishes)], mates[(6 * k + number) % len(mates)]
 
 
 def _teammates(layout: Layout, split: str) -> list[dict[str, Any]]:
-    """Return the teammates of a split on a layout, with the families in turn.
+    """Return the teammates of a split on a layout; the families take turns.
 
-    In validation and test, a teammate that never acts follows after each round.
+    In validation and test, a teammate that never acts follows after each round of families.
     """
     found = []
     for instance in range(INSTANCES):

@@ -51,7 +51,7 @@ def reference_returns(layout: Layout, teammates: Sequence[Policy], episodes: int
 
 
 def reference_egos(returns: np.ndarray, self_play: float | None = None) -> ReferenceEgos:
-    """Return the record of one teammate's measurements.
+    """Return the record of the reference egos' returns with one teammate.
 
     Args:
         returns: float64 (egos,), the teammate's row of `reference_returns`.
@@ -85,14 +85,14 @@ def play_reference_egos(
     # Policies that see observations or state records of one layout need the layout without padding.
     every = all(family.sees == "situation" for _, family in families)
     tables, expert, _ = (padded_layout if every else unpadded_layout)(layout)
-    play = _compile(
+    play = _compiled_play(
         tuple((tuple(numbers), family._replace(params=())) for numbers, family in families), tuple(pairs), field
     )
     return play(tables, expert, [family.params for _, family in families], keys)
 
 
 @lru_cache(maxsize=16)
-def _compile(
+def _compiled_play(
     families: tuple[tuple[tuple[int, ...], Policy], ...], pairs: tuple[tuple[str, int], ...], field: str
 ) -> Callable[..., Array]:
     """Return a compiled function of the layout's tables, the parameters of the oracle and of each family, and keys."""

@@ -59,7 +59,7 @@ VALIDATES = 5
 
 _SPECIALISTS: dict[str, tuple[dict[str, float], ...]] = {
     "recipe_aware_button": (
-        {"task_specialization": 1.0},  # the teammate only plates and delivers
+        {"task_specialization": 1.0},  # the teammate only plates and delivers soups
         {"wrong_ingredient_prob": 1.0},  # the teammate fetches wrong ingredients
         {"path_blocking": 1.0},  # the teammate blocks pots and goals
         {"plate_timing": 1.0},  # the teammate fetches a plate early
@@ -135,7 +135,7 @@ class SpreadTeammate(Struct, forbid_unknown_fields=True):
 
 
 class LayoutSpread(Struct, forbid_unknown_fields=True):
-    """The chosen teammates of a layout, in the order of their choice, and numbers of candidates.
+    """Teammates chosen for a layout, in the order in which they were chosen, and numbers of candidates.
 
     Attributes:
         layout: short name of a training layout.
@@ -158,7 +158,7 @@ class LayoutSpread(Struct, forbid_unknown_fields=True):
         return layout_order(self.layout)
 
     def of_split(self, split: str) -> list[SpreadTeammate]:
-        """Return the chosen teammates of split "train" or "validation", in the order of their choice."""
+        """Return the chosen teammates of split "train" or "validation", in order of choice."""
         return [mate for mate in self.chosen if mate.split == split]
 
 
@@ -194,8 +194,8 @@ def spread_teammates(layout: str, split: str, count: int) -> list[dict[str, Any]
     found = spread.of_split(split)
     if count > len(found):
         raise OptionError(
-            f"{spread.layout}: {count} {split} teammates requested of teammates/spread.jsonl, which has {len(found)}: "
-            f"{spread.unlike_tests} of {spread.tried} candidates differ from the test teammates, and "
+            f"{spread.layout}: {count} {split} teammates requested from teammates/spread.jsonl, which has "
+            f"{len(found)}: {spread.unlike_tests} of {spread.tried} candidates differ from the test teammates, and "
             f"{spread.headroom} of these have headroom; request fewer"
         )
     return [mate.entry for mate in found[:count]]

@@ -184,7 +184,9 @@ class TestStateFile:
                 read()
 
     def test_saving_two_leaves_with_the_same_path_raises_error(self, file):
-        with pytest.raises(ValueError, match="same path"):
+        with pytest.raises(
+            ValueError, match="2 leaves of the state, but 1 different paths: give every leaf its own path"
+        ):
             file.save({"a/b": jnp.int32(0), "a": {"b": jnp.int32(1)}}, 1)
 
 
@@ -199,7 +201,7 @@ def test_only_the_latest_checkpoints_are_kept(tmp_path):
     like = {"step": jnp.int32(0)}
     found, step = checkpoints.load(like)
     assert (int(found["step"]), step) == (100, 100)
-    assert int(checkpoints.at(10).load(like)["step"]) == 10
+    assert int(checkpoints.state_file(10).load(like)["step"]) == 10
 
 
 def test_resumed_log_drops_lines_after_the_saved_state(tmp_path):

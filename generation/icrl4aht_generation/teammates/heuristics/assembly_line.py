@@ -1,4 +1,4 @@
-"""Heuristic family H3 `assembly_line`: brings ingredients, or plates and delivers, with mistakes (paper, App. B.2)."""
+"""Heuristic family H3 `assembly_line`: fetches ingredients, or plates and delivers soups, with mistakes (App. B.2)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def act_assembly_line(params, memory: Key[Array, ""], scene: Scene) -> tuple[Int
     following, u = draw(memory)
     idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _hesitation_factor(scene))
     makes_room = _should_step_aside(scene)
-    # Deliveries and emergency moves are never mistaken, as in the published teammates.
+    # As in the published code, mistakes never replace deliveries and emergency moves.
     final, action = _choose_action(scene, params, abandons=u[2] < params["task_abandon_prob"])
     slips = ~(idles | makes_room | final)
     action, following = _with_mistakes(scene, params, action, slips, u[1], following)
@@ -41,7 +41,7 @@ def act_assembly_line(params, memory: Key[Array, ""], scene: Scene) -> tuple[Int
 
 def _hesitation_factor(scene: Scene) -> Array:
     """Return a factor of the chance to hesitate, float32 in 0..0.9, which is a fixed pattern over the cells."""
-    x, y = jnp.asarray(scene.tables.column)[scene.me], jnp.asarray(scene.tables.row)[scene.me]
+    x, y = jnp.asarray(scene.tables.column)[scene.own_cell], jnp.asarray(scene.tables.row)[scene.own_cell]
     return jnp.asarray(_HESITATION_FACTORS)[(7 * x + 13 * y) % 10]
 
 
@@ -50,13 +50,13 @@ def _choose_action(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Boo
     empty, plate, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_ingredient
     soup, cooking = jnp.any(scene.cooked), jnp.any(scene.cooking)
     final = scene.holds_dish | (ingredient & soup)
-    # If a soup is done, an agent puts an ingredient in its hand down at once.
+    # If a soup is done, an agent that carries an ingredient puts it down at once.
     ingredient &= ~soup
     plates_now = soup | (cooking & (params["plate_urgency"] > 0.5))
     plater = (params["role_mode"] == PLATER) | ((params["role_mode"] == FLEX) & plates_now)
     runner = ~plater
-    # Count the partner's ingredient as already in the pot: else both agents would fetch the last missing piece.
-    coming = scene.counts(scene.partner_hand) * is_ingredient(scene.partner_hand)
+    # Count the partner's ingredient as already in the pot, or else both agents fetch the last missing piece.
+    coming = scene.ingredient_counts(scene.partner_hand) * is_ingredient(scene.partner_hand)
     chosen = scene.first(
         [
             Rule(scene.holds_dish, scene.goals),
@@ -69,7 +69,7 @@ def _choose_action(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Boo
             Rule(runner & empty, scene.piles_of(scene.needed - coming > 0)),
             Rule(plater & plate, scene.cooked),
             Rule(plater & empty, scene.plate_piles),
-            # By the remaining rules, agents without a possible task wait at the place of their next task.
+            # The remaining rules let agents without a possible task wait at the place of their next task.
             Rule(plater & (plate | empty), scene.pots_in_use, waits=True),
             Rule((runner & empty) | (plater & plate), scene.pots, waits=True),
             Rule(empty | (plater & plate), scene.buttons, waits=True),
@@ -85,16 +85,16 @@ def _step(scene: Scene, target: Int[Array, ""]) -> Int[Array, ""]:
     step, _ = scene.approach(target)
     if scene.slot == 0:
         return step
-    distance = scene.distances(scene.partner)[scene.destination(step)]
+    distance = scene.distances(scene.partner_cell)[scene.destination(step)]
     return jnp.where((step < STAY) & (distance <= 1), STAY, step)
 
 
 def _handoff_counters(scene: Scene, params) -> Bool[Array, " cells"]:
-    """Return empty counters for an ingredient that no pot takes, by handoff style; else all empty counters."""
+    """Return the empty counters that the handoff style prefers for an ingredient, or else all empty counters."""
     x, y, floor = (jnp.asarray(table) for table in (scene.tables.column, scene.tables.row, scene.tables.walkable))
     middle_x, middle_y = (jnp.sum(axis * floor) // jnp.sum(floor) for axis in (x, y))
     central = jnp.abs(x - middle_x) + jnp.abs(y - middle_y) <= 3
-    near_partner = scene.manhattan(scene.cell, scene.partner) <= 2
+    near_partner = scene.manhattan(scene.cells, scene.partner_cell) <= 2
     free = scene.empty_counters
     at_pots = free & scene.cells_near(POT)
     near_partner = _first_nonempty(free & near_partner, at_pots)
@@ -109,20 +109,20 @@ def _first_nonempty(mask: Bool[Array, " cells"], other: Bool[Array, " cells"]) -
 
 def _should_step_aside(scene: Scene) -> Bool[Array, ""]:
     """Return whether agent 1 has empty hands and is adjacent to a partner who carries an item."""
-    adjacent = scene.manhattan(scene.me, scene.partner) == 1
+    adjacent = scene.manhattan(scene.own_cell, scene.partner_cell) == 1
     return scene.holds_nothing & (scene.partner_hand > 0) & adjacent & (scene.slot == 1)
 
 
 def _step_aside(scene: Scene) -> Int[Array, ""]:
     """Return a step away from the adjacent partner; else a step sideways (right or down first); else stay."""
-    from_partner = scene.neighbours(scene.me) == scene.partner  # above, below, left, right
+    from_partner = scene.neighbours(scene.own_cell) == scene.partner_cell  # partner above, below, left or right
     across = from_partner[2] | from_partner[3]
     # Each array has the scores of the moves right, down, left and up.
     sideways_in_row = jnp.array([2, 0, 1, 0])
     sideways_in_column = jnp.array([0, 2, 0, 1])
     away = 3 * from_partner[jnp.array([2, 0, 3, 1])]
     score = away + jnp.where(across, sideways_in_column, sideways_in_row)
-    return scene.best_way(scene.free & (score > 0), score)
+    return scene.best_move(scene.free_moves & (score > 0), score)
 
 
 def _with_mistakes(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], u: Array, key: Key[Array, ""]):
@@ -137,7 +137,7 @@ def _with_mistakes(scene: Scene, params, action: Int[Array, ""], slips: Bool[Arr
     width, height = jnp.asarray(scene.tables.size)
     # This is the published formula of the home cell; if the cell is a wall, the teammate never walks home.
     home = (3 * scene.slot % height) * width + 5 * scene.slot % width
-    far, is_floor = scene.manhattan(scene.me, home) > 2, jnp.asarray(scene.tables.walkable)[home]
+    far, is_floor = scene.manhattan(scene.own_cell, home) > 2, jnp.asarray(scene.tables.walkable)[home]
     goes = may_return & far & (jax.random.uniform(own) < params["stubbornness"]) & is_floor
     return jnp.where(goes, scene.first_step(home), action), key
 

@@ -87,7 +87,7 @@ def _choose_action(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[
     # As in the published code, the button uses the random number u1 a second time.
     presses = u[0] < params["press_L_when_unknown"] * (1 - params["cost_sensitivity"])
     fetches_plate = empty & ((_plate_is_urgent(scene, params) & ~cooks_only) | delivers_only)
-    fetches_plate &= ~(second & _leaves_plates(scene))
+    fetches_plate &= ~(second & _should_leave_plates(scene))
     cooks = empty & ~delivers_only
     errs = cooks & (u[1] < params["wrong_ingredient_prob"]) & (jnp.max(ids) > 0)
     right = _right_ingredient(scene, params, recipe, second)
@@ -110,7 +110,7 @@ def _choose_action(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[
             Rule(empty, scene.pots, waits=True),
         ]
     )
-    # Only rules that fetch ingredients, from `errs` on, can be replaced by blocking or a wrong ingredient.
+    # Blocking and wrong ingredients can only replace the rules after `first_rules`.
     settled = chosen.found & (chosen.number < len(first_rules))
     action = scene.go_to(chosen.target, chosen.waits, _step(scene, chosen.target, cramped))
     gives_way, aside = _yield_pot(scene, chosen.target)
@@ -119,7 +119,7 @@ def _choose_action(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[
     blocks, step = _blocking_step(scene)
     blocks &= cooks & (u[2] < params["path_blocking"]) & ~settled
     action = jnp.where(blocks, step, action)
-    clears = cramped & plate & is_dish(scene.partner_hand) & ~jnp.any(scene.reach(scene.cooked))
+    clears = cramped & plate & is_dish(scene.partner_hand) & ~jnp.any(scene.reachable(scene.cooked))
     action = jnp.where(clears, _step_out_of_way(scene), action)
     pressed = chosen.found & (chosen.number == press_rule)
     return action, considered, pressed, errs & ~settled & ~blocks
@@ -134,21 +134,21 @@ def _plate_is_urgent(scene: Scene, params) -> Bool[Array, ""]:
 
 
 def _recognized_types(scene: Scene) -> Bool[Array, " 3"]:
-    """Return the ingredient types that H1 recognizes in an item; as in the published code, not id 3."""
+    """Return which ingredient types H1 recognizes in an item: all except id 3, as in the published code."""
     return jnp.asarray(scene.tables.ingredients) < 3
 
 
-def _missing(scene: Scene, recipe: UInt8[Array, ""]) -> Int[Array, "P 3"]:
+def _missing_ingredients(scene: Scene, recipe: UInt8[Array, ""]) -> Int[Array, "P 3"]:
     """Return the number of missing ingredients of the recipe in each pot; 0 for pots that take no ingredient."""
-    missing = jnp.maximum(scene.counts(recipe) - scene.counts(scene.state.pot_items), 0)
+    missing = jnp.maximum(scene.ingredient_counts(recipe) - scene.ingredient_counts(scene.state.pot_items), 0)
     return missing * scene.fillable_pots[:, None] * _recognized_types(scene)
 
 
 def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
     """Return pots that need the ingredient in the hand; if no pot needs it, all pots that take an ingredient."""
-    # Pots with wrong ingredients also take ingredients: without a better pot, H1 fills these pots.
-    held = scene.counts(scene.hand)
-    wanting = scene.at(POT, _missing(scene, recipe) @ held > 0)
+    # Pots with wrong ingredients also take ingredients, and H1 fills them if no pot needs its ingredient.
+    held = scene.ingredient_counts(scene.hand)
+    wanting = scene.values_on_cells(POT, _missing_ingredients(scene, recipe) @ held > 0)
     wanted_everywhere = jnp.any((held > 0) & ~_recognized_types(scene))
     return jnp.where(jnp.any(wanting) & ~wanted_everywhere, wanting, scene.fillable_pot_cells)
 
@@ -156,7 +156,7 @@ def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
 def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], second: Array) -> Int[Array, ""]:
     """Return the id of the ingredient to fetch, or -1; on a cramped layout, the agents fetch different ingredients."""
     ids = jnp.asarray(scene.tables.ingredients)
-    missing = _missing(scene, recipe).sum(axis=0) > 0
+    missing = _missing_ingredients(scene, recipe).sum(axis=0) > 0
     # Two teammates share the work without communication by fetching different ingredients.
     nth = jnp.cumsum(missing)
     wanted = jnp.where(second & (jnp.sum(missing) > 1), nth == 2, nth == 1)
@@ -168,7 +168,7 @@ def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], second: Ar
 def _blocking_step(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Return whether the agent can reach a cell next to a pot or goal, and the step to the nearest such cell."""
     critical = (scene.cells_near(POT) | scene.cells_near(GOAL)) & jnp.asarray(scene.tables.walkable)
-    distance = jnp.where(critical, scene.distances(scene.me), UNREACHABLE)
+    distance = jnp.where(critical, scene.distances(scene.own_cell), UNREACHABLE)
     nearest = jnp.argmin(distance)
     return distance[nearest] < UNREACHABLE, scene.first_step(nearest)
 
@@ -188,47 +188,47 @@ def _step(scene: Scene, target: Int[Array, ""], cramped: Bool[Array, ""]) -> Int
     else:
         pushes = ~scene.holds_dish
         around = scene.sidestep(jnp.where(pushes, step, STAY))
-        around = jnp.where(scene.holds_ingredient & (jnp.sum(scene.free) < 2), step, around)
-    return jnp.where(cramped & (scene.destination(step) == scene.partner), around, step)
+        around = jnp.where(scene.holds_ingredient & (jnp.sum(scene.free_moves) < 2), step, around)
+    return jnp.where(cramped & (scene.destination(step) == scene.partner_cell), around, step)
 
 
 def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Return whether a partner with an ingredient is about as near to the pot, and a step away from the pot."""
-    access = scene.single_access(pot)
-    as_near = scene.manhattan(scene.partner, access) <= scene.manhattan(scene.me, access) + 1
+    access = scene.single_access_cell(pot)
+    as_near = scene.manhattan(scene.partner_cell, access) <= scene.manhattan(scene.own_cell, access) + 1
     gives_way = is_ingredient(scene.partner_hand) & (access >= 0) & as_near
-    return gives_way, scene.best_way(scene.free, scene.manhattan(scene.ways, access))
+    return gives_way, scene.best_move(scene.free_moves, scene.manhattan(scene.move_cells, access))
 
 
-def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
-    """Return whether to leave plates that have only one access cell to a partner who carries no plate or dish."""
+def _should_leave_plates(scene: Scene) -> Bool[Array, ""]:
+    """Return whether plates with only one access cell are left to a partner who carries no plate or dish."""
     first = jnp.argmax(scene.plate_piles)
-    single = jnp.any(scene.plate_piles) & (scene.single_access(first) >= 0)
+    single = jnp.any(scene.plate_piles) & (scene.single_access_cell(first) >= 0)
     carries = (scene.partner_hand == PLATE) | is_dish(scene.partner_hand)
     return ~carries & single
 
 
 def _step_out_of_way(scene: Scene) -> Int[Array, ""]:
-    """Return a step off the shortest paths to the goals, which a partner with a dish needs."""
+    """Return a step off the shortest paths that a partner with a dish can take to the goals."""
     exits, walkable = jnp.asarray(scene.tables.goal_access), jnp.asarray(scene.tables.walkable)
     if not len(exits):
         return jnp.int32(STAY)
     exists = exits < NOWHERE
     exits = jnp.where(exists, exits, 0)
-    from_exit = scene.manhattan(scene.cell[:, None], exits)
-    from_partner = scene.manhattan(scene.cell, scene.partner)
-    # A cell is between two other cells if the way over this cell is not longer.
+    from_exit = scene.manhattan(scene.cells[:, None], exits)
+    from_partner = scene.manhattan(scene.cells, scene.partner_cell)
+    # A cell is between two other cells if a path through this cell is as short as the direct path.
     detour = from_partner[:, None] + from_exit
-    between = jnp.any((detour == scene.manhattan(scene.partner, exits)) & exists, axis=1)
+    between = jnp.any((detour == scene.manhattan(scene.partner_cell, exits)) & exists, axis=1)
     in_the_way = walkable & (between | (from_partner == 1))
     from_exits = jnp.min(jnp.where(exists, from_exit, UNREACHABLE), axis=1)
-    leaves = scene.free & ~in_the_way[scene.ways]
+    leaves = scene.free_moves & ~in_the_way[scene.move_cells]
     # If all neighbour cells are in the way, move towards the free cell that is farthest from the goals.
     refuge = jnp.argmax(jnp.where(walkable & ~in_the_way, from_exits, -1))
-    to_refuge = scene.manhattan(scene.ways, refuge)
-    nearer = scene.free & (to_refuge < scene.manhattan(scene.me, refuge)) & jnp.any(walkable & ~in_the_way)
-    step = scene.best_way(leaves, from_exits[scene.ways], scene.best_way(nearer, -to_refuge))
-    return jnp.where(jnp.any(exists) & in_the_way[scene.me], step, STAY)
+    to_refuge = scene.manhattan(scene.move_cells, refuge)
+    nearer = scene.free_moves & (to_refuge < scene.manhattan(scene.own_cell, refuge)) & jnp.any(walkable & ~in_the_way)
+    step = scene.best_move(leaves, from_exits[scene.move_cells], scene.best_move(nearer, -to_refuge))
+    return jnp.where(jnp.any(exists) & in_the_way[scene.own_cell], step, STAY)
 
 
 RECIPE_AWARE_BUTTON = Heuristic(
@@ -244,10 +244,10 @@ RECIPE_AWARE_BUTTON = Heuristic(
             "strict_recipe": ((0.0, 1.0), 0.9, 1.0, 0.3, 1.0),
             "exploration_bias": ((0.0, 1.0), 0.1, 0.0, 0.5, 0.0),  # no effect: no rule uses this parameter
             "plate_timing": ((0.0, 1.0), 0.5, 0.6, 0.4, 0.7),
-            "dist_weight": ((0.1, 1.0), 0.3, 0.3, 0.4, 0.25),  # no effect: distances have no weight
+            "dist_weight": ((0.1, 1.0), 0.3, 0.3, 0.4, 0.25),  # no effect: distances are not weighted
             "inertia": ((0.0, 1.0), 0.4, 0.3, 0.5, 0.5),  # no effect: no rule uses the last intent
             "task_specialization": (None, 0.0, 0.0, 0.0, 0.0),
-            "stubbornness": (None, 0.0, 0.0, 0.0, 0.0),  # no effect: the published code ignores it
+            "stubbornness": (None, 0.0, 0.0, 0.0, 0.0),  # no effect: the published code ignores this parameter
             "wrong_ingredient_prob": (None, 0.0, 0.0, 0.0, 0.0),
             "idle_prob": (None, 0.0, 0.0, 0.0, 0.0),
             "path_blocking": (None, 0.0, 0.0, 0.0, 0.0),

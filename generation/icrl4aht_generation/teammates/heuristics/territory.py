@@ -43,19 +43,19 @@ def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Ar
     action = jnp.where(mode == BLOCKER, blocked, action)
     action = jnp.where((mode == LAZY) & (u[0] > params["action_probability"]), STAY, action)
     # Intended waiting also counts as stuck, so agents that wait for each other separate.
-    stuck = jnp.where(scene.me == memory.cell, memory.stuck + 1, 0)
-    return action, TerritoryMemory(following, scene.me, stuck)
+    stuck = jnp.where(scene.own_cell == memory.cell, memory.stuck + 1, 0)
+    return action, TerritoryMemory(following, scene.own_cell, stuck)
 
 
 def _step_to_middle(scene: Scene) -> Int[Array, ""]:
     """Return the step towards the middle: first to the middle column, then along this column; stay at a wall."""
-    x, y = jnp.asarray(scene.tables.column)[scene.me], jnp.asarray(scene.tables.row)[scene.me]
+    x, y = jnp.asarray(scene.tables.column)[scene.own_cell], jnp.asarray(scene.tables.row)[scene.own_cell]
     middle_x, middle_y = jnp.asarray(scene.tables.size) // 2
     # On most layouts, no agent can pass a blocker in the middle column.
     across = jnp.where(x < middle_x, RIGHT, LEFT)
     along = jnp.where(y < middle_y, DOWN, jnp.where(y > middle_y, UP, STAY))
     action = jnp.where(x == middle_x, along, across)
-    blocked = jnp.asarray(scene.tables.moves)[scene.me, action] == scene.me
+    blocked = jnp.asarray(scene.tables.moves)[scene.own_cell, action] == scene.own_cell
     return jnp.where(blocked, STAY, action)
 
 
@@ -108,17 +108,17 @@ def _rule_action(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, "
 
 
 def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
-    """Return the step towards a target, around the partner; agent 1 waits for a partner at the target's only access."""
-    # Thresholds are float32, because a stored 0.1 or 0.3 must reach the threshold as in the published code.
+    """Return the step towards a target, around the partner; agent 1 waits for a partner at the only access cell."""
+    # Thresholds are float32 like the parameters, so a parameter of 0.1 or 0.3 reaches the threshold.
     step, cost = scene.approach(target)
-    goes_around = scene.destination(step) == scene.partner
+    goes_around = scene.destination(step) == scene.partner_cell
     if scene.slot == 0:
         goes_around &= params["yield_bias"] >= np.float32(0.3)
     step = jnp.where(goes_around, scene.sidestep(STAY), step)
     if scene.slot == 0:
         return step
-    access = scene.single_access(target)
-    near = scene.distances(scene.partner)[access] <= 1
+    access = scene.single_access_cell(target)
+    near = scene.distances(scene.partner_cell)[access] <= 1
     waits = (access >= 0) & near & (cost <= 2) & (params["yield_bias"] >= np.float32(0.1))
     return jnp.where(waits, STAY, step)
 
@@ -126,13 +126,13 @@ def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
 def _territory_targets(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array, "masks cells"]:
     """Return the reachable cells of each mask in the agent's territory, or else in the shared territory.
 
-    If both are empty, masks with a fallback return all reachable cells, and other masks none.
+    If both are empty, the result is all reachable cells for masks with a fallback, and no cells for other masks.
     """
     # Two finished soups give the highest urgency: then even strict teammates help outside their territory.
     urgency = jnp.minimum(jnp.sum(scene.cooked) / 2, 1)
     anywhere = (urgency > params["rescue_threshold"]) | (params["strictness"] <= 0.5)
-    reach = scene.reach(jnp.stack([mask for mask, _ in masks]))
-    strict, relaxed = (reach & area for area in areas(scene, params))
+    reach = scene.reachable(jnp.stack([mask for mask, _ in masks]))
+    strict, relaxed = (reach & area for area in territories(scene, params))
     fallback = jnp.asarray(np.array([[fallback] for _, fallback in masks]))
     found = jnp.where(
         jnp.any(strict, axis=1, keepdims=True),
@@ -142,7 +142,7 @@ def _territory_targets(scene: Scene, params, masks: list[tuple[Array, bool]]) ->
     return jnp.where(anywhere, reach, found)
 
 
-def areas(scene: Scene, params) -> tuple[Bool[Array, " cells"], Bool[Array, " cells"]]:
+def territories(scene: Scene, params) -> tuple[Bool[Array, " cells"], Bool[Array, " cells"]]:
     """Return the agent's territory, and the territory with the shared margin.
 
     An agent in mode INVADER has the territory of its partner.

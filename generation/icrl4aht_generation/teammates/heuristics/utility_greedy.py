@@ -47,10 +47,10 @@ def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[
 
 def _choose_action(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """Return the best intent (-1 if no intent is feasible) and the action of this intent."""
-    cooked, cooking, fillable = map(scene.reach, (scene.cooked, scene.cooking, scene.fillable_pot_cells))
-    # An agent with a plate goes to a soup that still cooks if no soup is finished.
+    cooked, cooking, fillable = map(scene.reachable, (scene.cooked, scene.cooking, scene.fillable_pot_cells))
+    # If no soup is finished, an agent with a plate goes to a soup that is still cooking.
     waits = scene.holds_plate & ~jnp.any(cooked) & jnp.any(cooking)
-    needed = scene.reach(scene.needed_piles)
+    needed = scene.reachable(scene.needed_piles)
     stageable = scene.empty_counters & scene.cells_near(POT)
     prefers_pots = jnp.any(stageable) & (params["counter_preference"] > 0.5)
     targets = jnp.stack(
@@ -68,10 +68,10 @@ def _choose_action(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[I
     values, allowed = _intent_values(scene, params, waits, jnp.any(needed))
     distance = jax.vmap(scene.nearest_distance)(targets)
     feasible = allowed & (distance < UNREACHABLE)
-    bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)  # for the last intent, to prevent wavering
+    bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)  # prevents wavering between intents
     scores = jnp.where(feasible, values - params["dist_weight"] * distance + bonus, -jnp.inf)
     best = jnp.argmax(scores)
-    target = scene.closest(targets[best])
+    target = scene.nearest_cell(targets[best])
     action = scene.go_to(target, waits=waits & (best == PICK_UP))
     # If all scores are -inf, `argmax` returns 0, so `some` shows whether any intent is feasible.
     some = jnp.any(feasible)
@@ -81,16 +81,15 @@ def _choose_action(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[I
 def _intent_values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array, " 8"], Array]:
     """Return weight x value of each intent, float32 (8,), and whether the intent is allowed, bool (8,)."""
     cooking, cooked, nonfull = (jnp.sum(mask) for mask in (scene.cooking, scene.cooked, scene.fillable_pot_cells))
-    can_add = jnp.any(scene.reach(scene.fillable_pot_cells))
-    can_put_down = jnp.any(scene.reach(scene.empty_counters))
+    can_add = jnp.any(scene.reachable(scene.fillable_pot_cells))
+    can_put_down = jnp.any(scene.reachable(scene.empty_counters))
     plate = jnp.where(cooking + cooked > 0, 1 + 0.3 * cooking + 0.5 * cooked, jnp.where(nonfull == 0, 0.8, 0.2))
     fetch = jnp.where(
         needed_reachable,
         jnp.where(can_add, 1 + 0.2 * nonfull, 0.8),
         jnp.where(can_add, 0.4 + 0.05 * nonfull, 0.15),
     )
-    # As in the published code, the value of adding an ingredient rises with the free space in the fullest pot, not in
-    # the nearest pot.
+    # As in the published code, the value of adding an ingredient depends on the fullest pot, not the nearest pot.
     fullest = jnp.max(ingredient_count(scene.state.pot_items)).astype(jnp.int32)
     finished = 1 + 0.5 * cooked
     no_pot_in_use = cooking + cooked + nonfull == 0
@@ -116,7 +115,7 @@ def _intent_values(scene: Scene, params, waits, needed_reachable) -> tuple[Float
 
 def _yield_to_partner(scene: Scene, memory: GreedyMemory, action: Int[Array, ""]):
     """Return the action, which is sometimes `stay` next to the partner, and the number of steps to wait."""
-    distance = scene.manhattan(scene.destination(action), scene.partner)
+    distance = scene.manhattan(scene.destination(action), scene.partner_cell)
     # As in the published code, the random number is the key's first word, not a number drawn with the key.
     roll = jax.random.key_data(memory.key)[0] % 100
     yields = (action < STAY) & (distance <= 1) & (roll < 20 + 20 * scene.slot)
