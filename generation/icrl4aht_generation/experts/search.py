@@ -137,7 +137,7 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
     idle = jnp.all(new.pot_items == 0) & (new.hands[EGO] == 0)
     change = idle | refused[memory.belief] | paid.any()
     if advises:
-        fitting = jnp.all(Scene.counts(dishes) >= _begun_dish(new), axis=-1)
+        fitting = jnp.all(Scene.ingredient_counts(dishes) >= _begun_dish(new), axis=-1)
         score = score - 50.0 * ~fitting  # counts more than the teammate's hints, and less than what was paid or refused
         change |= ~fitting[memory.belief]
     belief = jnp.where(change, score.argmax(), memory.belief)
@@ -147,7 +147,7 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
 def _begun_dish(state: State) -> Int[Array, " 3"]:
     """Return the pieces of each ingredient in the dish that the ego carries, or in the fullest pot and in its hand."""
     hand, counts = state.hands[EGO], ingredient_count(state.pot_items)
-    in_hand = Scene.counts(hand & np.uint8(0xFF - COOKED))
-    in_pot = Scene.counts(state.pot_items[jnp.argmax(counts)] & np.uint8(0xFF - COOKED))
+    in_hand = Scene.ingredient_counts(hand & np.uint8(0xFF - COOKED))
+    in_pot = Scene.ingredient_counts(state.pot_items[jnp.argmax(counts)] & np.uint8(0xFF - COOKED))
     adds = (hand & PLATE == 0) & (counts.max() < 3)
     return jnp.where(hand & COOKED > 0, in_hand, in_pot + jnp.where(adds, in_hand, 0))
