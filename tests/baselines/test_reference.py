@@ -24,7 +24,7 @@ from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import evaluated_run
@@ -60,7 +60,9 @@ def test_reference_command_rejects_unknown_names(tmp_path):
     ):
         reference.check_learns_from_teacher("rl2-reference")
     command = ["research", "reference", "--name", "rl2-reference", "--out", str(tmp_path / "out"), "--teacher"]
-    assert "unknown agent" in run_cli(*command, "rl2-referenc", code=2) and not (tmp_path / "out").exists()
+    with pytest.raises(UnknownNameError, match="unknown agent 'rl2-referenc'"):
+        run_cli(*command, "rl2-referenc")
+    assert not (tmp_path / "out").exists()
 
 
 def test_reference_model_is_bundled_with_all_tracks(tmp_path, monkeypatch):
