@@ -367,7 +367,7 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
         if has_manifest():
             return
         if folder.exists() and any(folder.iterdir()) and not is_ours:
-            raise OptionError(f"{folder}: not empty, and not a download of {url}; give a new or an empty folder")
+            raise OptionError(f"{folder}: not empty, and not this version of {url}; give a new or an empty folder")
         folder.mkdir(parents=True, exist_ok=True)
         disk.write_atomically(path, text)
 

@@ -335,7 +335,7 @@ def training_sentence(config: Mapping[str, Any]) -> str:
         sentence, play = "It was trained by playing with teammates, not on learning histories.", config.get("play", {})
         if not play.get("imitation"):
             return sentence
-        part = f"In the first {play['imitation_end']:.0%} of its steps it also imitated"
+        part = f"In the first {min(1, play['imitation_end']):.0%} of its steps it also imitated"
         if config["histories"].get("searched"):
             part = f"{part} the script `search` in tasks with a hidden dish, and elsewhere"
         return f"{sentence} {part} the scripted oracle, which sees the full state."

@@ -71,6 +71,11 @@ class FieldArrays:
                 return self[name]
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in FIELDS:
+            raise AttributeError(f"{name} of a {type(self).__name__} is read from the release and cannot be set")
+        super().__setattr__(name, value)
+
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *FIELDS]
 

@@ -349,7 +349,8 @@ class Selection:
             NotStoredError: for `min_expert_return`, if the expert return of a remaining history is unknown.
         """
         # The query covers the release; `isin` keeps this selection's order and repeated histories.
-        found = self._select_if(np.isin(self.ids, self.index.query(**wanted)), f"has {wanted}")
+        named = ", ".join(f"{name} = {value!r}" for name, value in wanted.items() if value is not None)
+        found = self._select_if(np.isin(self.ids, self.index.query(**wanted)), f"has {named}")
         if learner is not None:
             learners = found.column("learner")
             known = ", ".join(map(str, np.unique(learners).tolist()))

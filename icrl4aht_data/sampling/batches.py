@@ -66,7 +66,7 @@ class Batches(Iterator[B], Generic[B]):
         self.next, self.served, self.waited = check_int("start", start, 0), 0, 0.0
         self._per_pass = 0 if self._stop is None else max(0, self._stop - self.next)
         self._closed, self._ended, self._process = False, False, os.getpid()
-        self._pool = _new_thread()
+        self._pool: ThreadPoolExecutor | None = None  # without it, batches can be pickled before the first one
         self._pending: deque[tuple[Future[B], B | None]] = deque()  # submitted batches with their buffers
         self._free: list[B] = []
         self._lent: B | None = None  # buffer of the batch in use by the consumer
@@ -125,6 +125,8 @@ class Batches(Iterator[B], Generic[B]):
 
     def _submit(self, first: int) -> None:
         """Submit batches to the thread until `prefetch` batches are pending, from number `first` on."""
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(1, thread_name_prefix="icrl4aht-prefetch")
         stop = first + self._prefetch
         for i in range(first + len(self._pending), stop if self._stop is None else min(stop, self._stop)):
             buffer = self._buffer()
@@ -145,8 +147,9 @@ class Batches(Iterator[B], Generic[B]):
         self._stop_thread()
 
     def _stop_thread(self) -> None:
-        self._pool.shutdown(cancel_futures=True)
-        self._pool = _new_thread()
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
         self._pending.clear()
         self._free.clear()
         self._lent = None
@@ -181,10 +184,6 @@ class Batches(Iterator[B], Generic[B]):
         self._stop_thread()
         self._closed = self._ended = False
         self.next = check_int("next", state["next"], 0)
-
-
-def _new_thread() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1, thread_name_prefix="icrl4aht-prefetch")
 
 
 # A function, not a method: a reference from the thread to the iterator would keep an abandoned iterator alive.

@@ -210,12 +210,12 @@ def test_download_refuses_folders_with_other_content(lite, full, tmp_path):
     target.mkdir()
     (target / ".bashrc").write_text("mine")
     with http_server(lite[0]) as server:
-        with pytest.raises(OptionError, match="not empty, and not a download of"):
+        with pytest.raises(OptionError, match="not empty, and not this version of"):
             plan_download(server.url, to=target)
         assert [path.name for path in target.iterdir()] == [".bashrc"]
         shutil.rmtree(target)
         shutil.copytree(full[0], target)
-        with pytest.raises(OptionError, match="not empty, and not a download of"):
+        with pytest.raises(OptionError, match="not empty, and not this version of"):
             plan_download(server.url, to=target)
     assert file_contents(target) == file_contents(full[0])
 

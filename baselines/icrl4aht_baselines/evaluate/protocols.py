@@ -144,7 +144,12 @@ def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
     """Return the first `count` tasks of each combination of layout and teammate kind; all tasks if `count` is None.
 
     A count of 2 chooses up to 2 tasks of each combination, not 2 tasks in all.
+
+    Raises:
+        OptionError: if `count` is not positive.
     """
+    if count is not None and count < 1:
+        raise OptionError(f"tasks = {count}: expected at least 1 task of each layout and teammate kind")
     groups = grouped(tasks, lambda task: (task.layout.name, task.teammate_kind))
     chosen = {task.task_id for group in groups.values() for task in group[:count]}
     return [task for task in tasks if task.task_id in chosen]

@@ -78,9 +78,11 @@ def prepare_play(
     hidden = [get_layout(one).name for one in histories.hide_recipe]
     groups = _task_groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
     # With few tasks, some teammates are in no group, so the record of training data must not state them.
-    searched = {layout for layout, _ in teammates if _wants_hidden_dish(layout)}
-    played = [task._replace(searched=task.layout in searched) for group in groups for task in group]
-    labels: Labels | None = "oracle" if play.imitation else None
+    fixed = {layout for layout, _ in teammates if _fixes_dish(layout)}
+    # The model imitates the searcher if it cannot see which dish is wanted.
+    unseen = [(task, task.hidden or not task.layout.shows_recipe) for group in groups for task in group]
+    played = [task._replace(searched=hidden and task.layout in fixed) for task, hidden in unseen]
+    labels: Labels | None = "oracle" if play.imitation else None  # the searcher also acts as the oracle does
     about = {
         "model": asdict(model),
         "play": asdict(play),
@@ -92,7 +94,7 @@ def prepare_play(
             "channels": "canonical",
             "obs_shape": list(observation_shape(layouts[0], True)),
             "groups": {group[0].name: len(group) for group in groups},
-            "searched": sorted({layout.name for layout in searched}),
+            "searched": sorted({task.label for task in played if task.searched}),
         },
         "trained_on": _training_record(dataset, tasks, {task.id for task in played}, labels),
     }
@@ -195,9 +197,9 @@ def _task_groups(
     return groups
 
 
-def _wants_hidden_dish(layout: Layout) -> bool:
-    """Return whether the tasks on a layout always want one of its dishes, which the ego does not see."""
-    return layout.recipes != get_layout(layout.name).recipes and not layout.shows_recipe
+def _fixes_dish(layout: Layout) -> bool:
+    """Return whether the tasks on a layout want one of its dishes in all episodes."""
+    return len(layout.recipes) == 1 and layout.recipes != get_layout(layout.name).recipes
 
 
 def _heuristic_teammates(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, Policy]]]:

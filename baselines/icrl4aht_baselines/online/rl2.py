@@ -209,7 +209,7 @@ class _Player:
         """Return the searcher's memory at the start of every task; None if the model imitates the oracle."""
         if not self._searched:
             return None
-        keys = jax.random.split(jax.random.fold_in(key, 1), len(self.tasks))
+        keys = jax.random.split(jax.random.fold_in(key, 2), len(self.tasks))
         return jax.vmap(self._script.init, in_axes=(None, 0))(self._script.params, keys)
 
     def _draw_change(self, key: Key[Array, ""]) -> ViewChange:
@@ -422,8 +422,8 @@ class PlayTrainer:
         keys = jax.random.split(play_key, len(self.players))
         programs = self.programs(state.params, state.tasks)
         played = [
-            play(state.params, player.mates, tasks, key)
-            for play, player, tasks, key in zip(programs, self.players, state.tasks, keys, strict=True)
+            program(state.params, player.mates, tasks, key)
+            for program, player, tasks, key in zip(programs, self.players, state.tasks, keys, strict=True)
         ]
         tasks, sequences, returns = zip(*played, strict=True)
         # Minibatches are sampled from all groups together, so that each one has many layouts.
@@ -445,10 +445,10 @@ class PlayTrainer:
         found = []
         keys = [jax.random.fold_in(jax.random.key(seed), number) for number in range(len(self.players))]
         states = [jax.jit(player.start)(key) for player, key in zip(self.players, keys, strict=True)]
-        for player, key, state, play in zip(self.players, keys, states, self.programs(params, states), strict=True):
+        for player, key, state, program in zip(self.players, keys, states, self.programs(params, states), strict=True):
             returns = []
             for step in range(-(-episodes // self.play.episodes)):
-                state, _, own = play(params, player.mates, state, jax.random.fold_in(key, step + 1))
+                state, _, own = program(params, player.mates, state, jax.random.fold_in(key, step + 1))
                 returns.append(np.asarray(own, np.float64))
             found.append(np.concatenate(returns, axis=-1)[:, :episodes])
         return np.concatenate(found)

@@ -64,7 +64,7 @@ class PlayOptions:
     task_end: Annotated[float, Meta(gt=0, le=1), Option("Chance that a task ends after a step's episodes.")] = 1 / 16
     imitation: Annotated[
         NotNegative,
-        Option("Weight of imitating a script at the start: the oracle, or `search` in tasks with one dish."),
+        Option("Weight of imitating a script at the start: the oracle, or `search` in tasks with a hidden dish."),
     ] = 1.0
     imitation_end: Annotated[Positive, Option("Share of the steps at which that weight has fallen to 0.")] = 0.5
     rearranged: Annotated[

@@ -17,8 +17,9 @@ from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
     EPISODE_STEPS,
     HEURISTIC_KINDS,
-    TESTED_ON,
+    TRACKS,
     layout_number,
+    track_layouts,
 )
 from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
@@ -83,7 +84,7 @@ def build_suite(
     wanted = [(run.layout.name, run.algorithm) for run in runs]
     selections = [
         select_teammates(suite, name, algorithm, config.train, config.heldout, seed)
-        for name in TESTED_ON
+        for name in training_layouts()
         for algorithm in ALGORITHMS
         if is_trained(suite, name, algorithm)
     ]
@@ -114,6 +115,11 @@ def population_runs(profile: Profile, algorithms: Mapping[str, Sequence[str]], s
     ]
 
 
+def training_layouts() -> list[str]:
+    """Return the names of all layouts with training tasks, registered layouts included."""
+    return list(dict.fromkeys(name for track in TRACKS for name in track_layouts(track, "train")))
+
+
 def report_diversity(
     suite: Path, layouts: Sequence[str], algorithms: Sequence[str], greedy: bool, console: Console
 ) -> None:
@@ -130,7 +136,7 @@ def report_diversity(
         OptionError: if a population is not finished, or no layout has all populations.
     """
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or [
-        name for name in TESTED_ON if all(is_trained(suite, name, algorithm) for algorithm in ALGORITHMS)
+        name for name in training_layouts() if all(is_trained(suite, name, algorithm) for algorithm in ALGORITHMS)
     ]
     if not names:
         raise OptionError(

@@ -111,6 +111,8 @@ def test_training_sequences_match_the_played_episodes(trainer, compiled_episodes
     """Training sequences contain the actions and rewards of two played episodes and the memory before them."""
     player, state = trainer.players[0], trainer.init()
     tasks, key = state.tasks[0], jax.random.key(3)
+    refused = jnp.ones_like(tasks.ego.searcher.refused)
+    tasks = tasks._replace(ego=tasks.ego._replace(searcher=tasks.ego.searcher._replace(refused=refused)))
     for number in range(3):  # a task that has not ended continues in the next episodes
         after, played, returns = compiled_episodes(state.params, player.mates, tasks, jax.random.fold_in(key, number))
         assert played.action.shape == (200, 8)
@@ -122,9 +124,9 @@ def test_training_sequences_match_the_played_episodes(trainer, compiled_episodes
         memory = np.asarray(after.ego.state)
         assert not memory[ended].any() and np.abs(memory[~ended]).sum() > 0
         np.testing.assert_array_equal(played.hidden[0], tasks.ego.state)
-        searcher, earlier = after.ego.searcher, tasks.ego.searcher
-        assert not np.asarray(searcher.refused | searcher.paid)[ended].any()
-        assert (searcher.refused | ~earlier.refused)[~ended].all(), "the searcher remembers refused dishes"
+        remembered, earlier = np.asarray(after.ego.searcher.refused), np.asarray(tasks.ego.searcher.refused)
+        assert not remembered[ended].any()
+        assert (remembered | ~earlier)[~ended].all() and (number or remembered[~ended].all())
         for before in (after.before.prev_action, after.before.prev_reward, after.before.prev_teammate_action):
             assert ended.any() and not np.asarray(before)[ended].any()  # new tasks have no previous step
         tasks = after
@@ -318,6 +320,8 @@ class TestPreparation:
             dishes = {task.layout.recipes for task in job.trainer.tasks}
             assert dishes == {task.layout.recipes for task in tasks}
             assert all(len(of_task) == 1 for of_task in dishes)
+            assert all(task.searched for task in job.trainer.tasks), "no indicator shows the dish"
+            assert job.about["histories"]["searched"] == [name]
 
     @pytest.mark.slow
     def test_teammates_on_rearranged_layouts_are_recorded(self):

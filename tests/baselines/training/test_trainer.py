@@ -333,21 +333,23 @@ class TestHeldOut:
         assert cell["histories"] < len(load_icrl4aht(layout="demo_simple", teammate_kind=one))
 
     @pytest.mark.parametrize(
-        ("filters", "message"),
+        ("filters", "error", "message"),
         [
             (
                 {"algorithm": ("fpc",)},
+                UnknownNameError,
                 r"unknown algorithm 'fpc'; valid: assembly_line, .*Did you mean 'fcp'",
             ),
-            ({"source": ("ppo", "dqn")}, "unknown source 'dqn'; valid: ppo, noise"),
+            ({"source": ("ppo", "dqn")}, UnknownNameError, "unknown source 'dqn'; valid: ppo, noise"),
             (
                 {"teammate_family": ("rl",), "algorithm": ("assembly_line",)},
+                EmptySelectionError,
                 r"no history has teammate_family=\('rl',\), algorithm=\('assembly_line',\)",
             ),
         ],
     )
-    def test_filters_that_match_no_history_raise_error(self, filters, message):
-        with pytest.raises((EmptySelectionError, UnknownNameError), match=message):
+    def test_filters_that_match_no_history_raise_error(self, filters, error, message):
+        with pytest.raises(error, match=message):
             training_job(None, layout="asymm_both", **filters)
 
     @pytest.mark.parametrize(

@@ -99,7 +99,6 @@ def test_jobs_in_local_processes_are_retried_and_reported(tmp_path):
     assert (tmp_path / "bad").read_text() == str(os.getpid())
 
 
-@pytest.mark.slow
 def test_quick_jobs_share_worker_processes(tmp_path):
     """A job that is not quick gets a new process."""
     jobs = [FileJob(tmp_path, f"{number}") for number in range(5)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import os
+import pickle
 import threading
 import time
 from pathlib import Path
@@ -151,6 +152,11 @@ def test_position_saved_before_an_option_existed_can_be_resumed(two_sources):
         state = {name: value for name, value in batches.state_dict().items() if name not in ("channels", "labels")}
         batches.load_state_dict(state | {"next": 7})
         assert_equal_batches(next(batches), sampler[7])
+
+
+def test_batches_can_be_pickled_before_the_first_batch(lite):
+    batches = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=2, length=10, seed=0).batches()
+    assert_equal_batches(next(pickle.loads(pickle.dumps(batches))), next(batches))
 
 
 @pytest.mark.parametrize(
