@@ -222,7 +222,7 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
             return request()
         except Icrl4ahtError:
             raise
-        except Exception as error:  # each client library raises errors of different classes
+        except Exception as error:  # each client library has its own error classes
             if isinstance(error, OSError) and error.errno in (*NO_ROOM, errno.EROFS):
                 raise
             status, cause = _http_status(error), _root_cause(error)

@@ -82,7 +82,7 @@ class BestResponseCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def chosen_training(trainings: Iterable[TrainedResponse]) -> TrainedResponse:
-    """Return the training run with the highest return in the episodes that decide which run is the best."""
+    """Return the training run with the highest mean return in the episodes of `choice`."""
     return max(trainings, key=lambda one: -math.inf if one.choice is None else one.choice)
 
 

@@ -63,7 +63,10 @@ def check_files(
 
 
 def _recorded_sizes(root: Path, listed: Mapping[str, str]) -> dict[str, int]:
-    """Return shard -> bytes from meta/info.json; empty if meta/info.json does not match the manifest."""
+    """Return the size in bytes of each shard, as recorded in meta/info.json.
+
+    The result is empty if that file cannot be read or does not match the manifest.
+    """
     try:
         shards = read_info(root).shards
         return shards if file_hash(root / INFO) == listed.get(INFO) else {}

@@ -24,7 +24,7 @@ from icrl4aht_data.utils.plugins import Plugins
 
 _REMEDIES = {
     errno.ENOENT: "check the path; a new file's folder has to exist",
-    **dict.fromkeys((errno.ENOTDIR, errno.EEXIST), "expected a folder, found a file: give another folder"),
+    **dict.fromkeys((errno.ENOTDIR, errno.EEXIST), "expected a folder, found a file: give the path of a folder"),
     errno.EISDIR: "expected a file, found a folder: give another name",
     **dict.fromkeys((errno.EACCES, errno.EPERM), "give a folder that you may write to, and files that you may read"),
     errno.EROFS: "give a folder that can be written to",

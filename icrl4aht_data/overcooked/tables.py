@@ -155,7 +155,10 @@ def stack_tables(layouts: Sequence[Layout]) -> Tables:
     each = [make_tables(layout, pots, buttons) for layout in layouts]
     without = [layout.name for layout in layouts if layout.ingredient_types > CANONICAL_TYPES]
     if 0 < len(without) < len(layouts):
-        raise OptionError(f"layouts {without} have ingredients without a canonical channel: stack them separately")
+        raise OptionError(
+            f"layouts {without} have ingredients without a canonical channel: stack these layouts separately from the "
+            f"others"
+        )
 
     return stack_padded(each, _PADDING)
 

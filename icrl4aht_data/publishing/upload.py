@@ -90,7 +90,10 @@ def upload_release(
 
     found, folder = re.fullmatch(r"hf://datasets/([\w.-]+/[\w.-]+)/?", str(address)), Path(folder)
     if found is None:
-        raise OptionError(f"{address!r}: expected hf://datasets/ORG/REPO; the tag is the data version")
+        raise OptionError(
+            f"{address!r}: expected hf://datasets/ORG/REPO without a tag; the upload is tagged with the release's data "
+            f"version"
+        )
     check_valid(folder, advance)
     api, repo, version = HfApi(), found[1], read_info(folder).data_version
     sizes = {name: (folder / name).stat().st_size for name in sorted([*read_manifest(folder), MANIFEST])}

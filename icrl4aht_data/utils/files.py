@@ -229,7 +229,7 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
     """
     if names is not None and os.path.lexists(path):
         if not path.is_dir():
-            raise OptionError(f"{path}: expected a folder, found a file; give another folder")
+            raise OptionError(f"{path}: expected a folder, found a file; give the path of a folder")
         if not overwrite and any(path.iterdir()):
             raise OptionError(f"{path}: exists; give another folder, or use --overwrite to replace its files")
     for file in [path] if names is None else [path / name for name in names]:
@@ -251,7 +251,7 @@ def check_folder_content(folder: Path, names: Collection[str], what: str) -> Non
         OptionError: if `folder` is not a folder or has other files; the message lists some of the other files.
     """
     if os.path.lexists(folder) and not folder.is_dir():
-        raise OptionError(f"{folder}: expected a folder, found a file; give another folder")
+        raise OptionError(f"{folder}: expected a folder, found a file; give the path of a folder")
     found = [final_name(path.name) for path in folder.iterdir()] if folder.is_dir() else []
     foreign = sorted(name for name in found if name not in names)
     if foreign:

@@ -71,7 +71,7 @@ def option_hints(kind: type) -> dict[str, Any]:
 
 
 def check_options(options: Any) -> None:
-    """Check the values of a dataclass against annotations that are options, choices or bounds.
+    """Check the type, the choices and the bounds of each dataclass field annotated with `Option`, `Literal` or `Meta`.
 
     Lists are converted to tuples.
 

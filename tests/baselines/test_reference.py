@@ -107,7 +107,7 @@ def test_card_of_a_reference_model_shows_command_and_training_curves(tmp_path, m
 
 
 @pytest.fixture
-def tiny_recipes(monkeypatch, tmp_path) -> Path:
+def tiny_training_recipes(monkeypatch, tmp_path) -> Path:
     """Use tiny recipes, one layout, few tasks, and a part of the bundled release as training data."""
     for name, recipe in RECIPES.items():
         sizes: dict[str, Any] = TINY if recipe.data else {"steps": 1, "batch_size": 8}
@@ -129,18 +129,18 @@ def tiny_recipes(monkeypatch, tmp_path) -> Path:
 
 
 @pytest.mark.slow
-def test_reference_model_trains_on_rl2_histories_then_on_its_own_histories(tiny_recipes):
-    maker = ReferenceMaker("layout", tiny_recipes, lambda *shown: None)
+def test_reference_model_trains_on_rl2_histories_then_on_its_own_histories(tiny_training_recipes):
+    maker = ReferenceMaker("layout", tiny_training_recipes, lambda *shown: None)
     found = maker.make("ad-reference", evaluates=False)
-    assert found.run == tiny_recipes / "ad-reference-layout" and found.results == {}
-    made = {path.name for path in tiny_recipes.iterdir() if path.is_dir() and not path.name.startswith(".")}
+    assert found.run == tiny_training_recipes / "ad-reference-layout" and found.results == {}
+    made = {path.name for path in tiny_training_recipes.iterdir() if path.is_dir() and not path.name.startswith(".")}
     own_round = {f"ad-reference-layout{end}" for end in ("", "-first", "-own", "-mixed")}
     assert made == {"noise", "rl2-reference-layout", "agent-layout", *own_round}
     trained = read_trained(found.run)
     assert trained.hide_recipe == ("asymm_both",) and trained.step == 2
     assert {cell["source"] for cell in trained.trained_on} == {"agent"}
-    own, mixed = (load_icrl4aht(tiny_recipes / f"ad-reference-layout-{name}") for name in ("own", "mixed"))
-    assert len(mixed) == len(own) + len(load_icrl4aht(tiny_recipes / "agent-layout"))
-    times = {path: path.stat().st_mtime_ns for path in tiny_recipes.rglob("*.safetensors")}
+    own, mixed = (load_icrl4aht(tiny_training_recipes / f"ad-reference-layout-{name}") for name in ("own", "mixed"))
+    assert len(mixed) == len(own) + len(load_icrl4aht(tiny_training_recipes / "agent-layout"))
+    times = {path: path.stat().st_mtime_ns for path in tiny_training_recipes.rglob("*.safetensors")}
     maker.make("ad-reference", evaluates=False)
-    assert {path: path.stat().st_mtime_ns for path in tiny_recipes.rglob("*.safetensors")} == times
+    assert {path: path.stat().st_mtime_ns for path in tiny_training_recipes.rglob("*.safetensors")} == times

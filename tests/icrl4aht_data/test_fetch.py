@@ -90,7 +90,7 @@ def shard_names(folder: Path) -> set[str]:
     return {path.name for path in (folder / "data").rglob("*.h5")}
 
 
-# Tests of reading
+# Tests of reading remote releases
 
 
 def test_remote_release_with_the_source_card_of_older_versions_can_be_opened(lite, tmp_path):

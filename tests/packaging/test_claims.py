@@ -172,7 +172,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/training", "its {} steps take two cores", lambda: TINY_SIZE.train["steps"]),
     ("docs/training", "A checkpoint is written every {} minutes", lambda: SAVE_MINUTES),
     ("docs/training", "A {} of the histories are held out", lambda: HistoryOptions(("demo_wide",)).held_out),
-    ("docs/format", "{}, the version of this format, or {}", lambda: READABLE_VERSIONS[::-1]),
+    ("docs/format", "describes `format_version` {}. Version {} is read too", lambda: READABLE_VERSIONS[::-1]),
     ("docs/format", "steps until cooked, 0 to {};", lambda: POT_STEPS),
     ("docs/format", "a button's light stays on, 0 to {};", lambda: BUTTON_STEPS),
     (

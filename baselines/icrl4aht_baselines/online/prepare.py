@@ -203,11 +203,13 @@ def _fixes_dish(layout: Layout) -> bool:
 
 
 def _heuristic_teammates(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, Policy]]]:
-    """Return layout -> kind -> heuristic teammates, which can play on every layout because they see a `Situation`.
+    """Return the heuristic teammates of each layout, by kind.
+
+    Heuristic teammates can also play on rearranged layouts, because they get the full state and the layout's tables.
 
     Raises:
-        OptionError: if a layout has only learned teammates, or has tasks with a fixed dish, which other versions of the
-            layout do not have.
+        OptionError: if a layout has only learned teammates, or if its tasks have a fixed dish, because `--rearranged`
+            and `--four-recipes` change the dishes.
     """
     for layout, _ in teammates:
         if layout.recipes != get_layout(layout.name).recipes:

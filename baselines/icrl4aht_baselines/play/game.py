@@ -160,7 +160,7 @@ class Game:
         self._restart(players)
 
     def with_players(self, players: Sequence[PolicyPlayer | None]) -> Game:
-        """Return a copy of this game that other players play from its first step."""
+        """Return a copy of this game at its first step, with the given players."""
         other = copy(self)
         other._restart([copy(player) for player in players])
         return other

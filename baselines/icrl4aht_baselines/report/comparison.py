@@ -72,7 +72,12 @@ class StoredResults:
     agents: dict[str, AgentFacts] = field(default_factory=dict)
 
     def returns(self, control: str = "") -> dict[str, AgentReturns]:
-        """Return agent -> results on test tasks under the page's protocol and a control, in the order of `agents`."""
+        """Return the results of each agent on the test tasks under the protocol of the page, in the order of `agents`.
+
+        Args:
+            control: "cleared" or "swapped", see `protocols.CONTROLS`, or one of `OTHER_WAYS` of choosing actions; empty
+                for results without a control and in the agent's own way.
+        """
         table = self.table
         chosen = (table["protocol"] == SUBMITTED_PROTOCOL) & (table["control"] == control) & (table["kind"] == "test")
         found = dict(iter(table[chosen].groupby("agent", sort=False)))

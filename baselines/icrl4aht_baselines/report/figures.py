@@ -24,7 +24,8 @@ from icrl4aht_data.plotting import return_limits, running_mean
 SMOOTHING = 10
 """Largest number of episodes in a curve's running mean; shorter curves use a tenth of their episodes."""
 
-_SCORE_LIMITS = (-0.5, 1.5)  # scores beyond these limits, which occur where the headroom is small, are clipped
+# Scores beyond these limits are clipped; they occur where a best response earns little more than `stay`.
+_SCORE_LIMITS = (-0.5, 1.5)
 _TICKS = 5
 _DRAWING = 1000  # units of a panel's width and height
 

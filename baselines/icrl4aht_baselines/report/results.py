@@ -80,7 +80,9 @@ _KIND_OF_SPLIT = {"validation": "validation", "train": "training", "heldout": "h
 
 
 class ResultCell(NamedTuple):
-    """Result cell (layout, family of teammates, kind of tasks): the tasks over which reports average.
+    """A group of tasks with the same layout, teammate family and kind of task.
+
+    Reports average returns over each group.
 
     Attributes:
         layout: name of the layout.

@@ -323,7 +323,8 @@ def blocks_text(cells: Sequence[CellReturns]) -> str:
     Args:
         cells: returns of an agent in several result cells (layout, family of teammates, kind of tasks).
     """
-    # The cells may have different numbers of episodes, so only blocks that all of them have are shown.
+    # Result cells may have different numbers of episodes, so only the episode blocks that every result cell has are
+    # shown.
     names = [name for name in EPISODE_BLOCKS if all(name in of.blocks for of in cells)]
     return ", ".join(f"{name}: {mean_of(of.blocks[name] for of in cells):z.1f}" for name in names)
 

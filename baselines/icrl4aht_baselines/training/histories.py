@@ -114,7 +114,7 @@ def history_settings(dataset: Dataset) -> dict[str, Any]:
 
 
 def _batch_view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | None:
-    """Return the training's function from batches to observations; None for unchanged state records."""
+    """Return the function that makes the encoder's input from a batch; None for state records without changes."""
     changed = [f"mirror = {mirror}"] * mirror + [f"hide_recipe = {', '.join(hidden)}"] * bool(hidden)
     if changed and (dataset.obs != "state" or dataset.channels != "canonical"):
         raise OptionError(

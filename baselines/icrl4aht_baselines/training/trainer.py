@@ -166,7 +166,7 @@ class Trainer:
             return gradient, log
 
         def split_rows(rows: Array) -> Array:
-            """Reshape (B, ..) to (parts, B / parts, ..), so that every part has rows on every device."""
+            """Split rows (B, ..) into interleaved parts (parts, B / parts, ..): each part has rows on every device."""
             rows = rows.reshape(-1, parts, *rows.shape[1:]).swapaxes(0, 1)
             return jax.lax.with_sharding_constraint(rows, self._parts)
 

@@ -145,7 +145,10 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
 
 
 def _begun_dish(state: State) -> Int[Array, " 3"]:
-    """Return the pieces of each ingredient in the dish that the ego carries, or in the fullest pot and in its hand."""
+    """Return the number of pieces of each ingredient in the soup that the ego carries.
+
+    If it carries no soup, count the fullest pot and the ingredient in the ego's hand, if that pot has room for it.
+    """
     hand, counts = state.hands[EGO], ingredient_count(state.pot_items)
     in_hand = Scene.ingredient_counts(hand & np.uint8(0xFF - COOKED))
     in_pot = Scene.ingredient_counts(state.pot_items[jnp.argmax(counts)] & np.uint8(0xFF - COOKED))

@@ -282,7 +282,7 @@ class Conv3x3(nn.Module):
         channels = x.shape[-1] // VISIBLE
         kernel = self.param("kernel", nn.initializers.orthogonal(2**0.5), (3, 3, channels, self.features))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
-        # The tenth tap is zero, for pairs of cells that are not adjacent.
+        # A zero follows the nine kernel weights; pairs of cells that are more than one cell apart use it.
         taps = jnp.concatenate([kernel.reshape(9, channels, self.features), jnp.zeros_like(kernel[:1, 0])])
         matrix = taps[_tap_of_cells()].transpose(0, 2, 1, 3).reshape(VISIBLE * channels, VISIBLE * self.features)
         return x @ matrix + jnp.tile(bias, VISIBLE)

@@ -61,7 +61,10 @@ def cross_play_returns(
 def _compiled_play(
     layout: Layout, widths: Widths, partners: int, first: tuple, second: tuple, episodes: int, greedy: bool
 ) -> Callable[[Any, Any, jax.Array], jax.Array]:
-    """Return a compiled function of egos, teammates and a key that returns mean returns of pairs (first, second)."""
+    """Compile a function (egos, teammates, key) -> mean return of each pair.
+
+    Pair i is ego `first[i]` with teammate `second[i]`.
+    """
     env, network = Environment(layout), ActorCritic(widths, partners)
     n = len(first) * episodes
     policies = [np.repeat(np.array(side), episodes) for side in (first, second)]

@@ -48,7 +48,7 @@ class _Spread(Struct, forbid_unknown_fields=True, kw_only=True):
     validation: Natural | dict[str, Natural] = 0
 
 
-class _Sampled(_Spread, kw_only=True):
+class _SampledTasks(_Spread, kw_only=True):
     """Fields of the section [tasks.sampled] of a profile."""
 
     families: _Names | dict[str, _Names]
@@ -72,7 +72,7 @@ class _Tasks(Struct, forbid_unknown_fields=True):
     sources: Annotated[_Names, Meta(min_length=1)] = ("ppo",)
     learners: Count = 1
     presets: _Names = ()
-    sampled: _Sampled | None = None
+    sampled: _SampledTasks | None = None
     spread: _Spread | None = None
     algorithms: _Names | dict[str, _Names] = ()
     preference: _Names = ()
@@ -208,7 +208,7 @@ def _read_section(
     return common, {each: replace_options(common, of, f"{name}.layouts.{each}.") for each, of in own.items()}
 
 
-def _sampled_config(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
+def _sampled_config(values: _SampledTasks, layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
     counts = _teammate_counts("tasks.sampled", values, layouts, sources)
     chosen: dict[str, Any] = _by_layout("tasks.sampled.families", values.families, layouts)
     families = {name: _check_distinct("tasks.sampled.families", chosen.get(name, ())) for name in layouts}

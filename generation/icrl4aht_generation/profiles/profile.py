@@ -118,10 +118,10 @@ class SpreadConfig:
 
 @dataclass(frozen=True)
 class SampledConfig(SpreadConfig):
-    """Numbers of heuristic teammates sampled from the published training ranges, see `teammates.draws`.
+    """How many heuristic teammates to sample from the published training ranges of their parameters.
 
     Attributes:
-        families: heuristic families by layout, from which teammates are chosen in turn.
+        families: for each layout, the heuristic families, which take turns, see `teammates.draws`.
     """
 
     families: dict[str, tuple[str, ...]]

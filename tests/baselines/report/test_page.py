@@ -114,7 +114,7 @@ def test_html_report_without_scores_has_no_score_columns(tmp_path):
     assert "one under protocol seeded, 3 seeds (0 to 2), 40 episodes" in text
 
 
-def test_score_bars_start_at_the_return_of_stay(invented_responses, tmp_path):
+def test_score_bars_start_at_the_return_of_the_ego_stay(invented_responses, tmp_path):
     run = evaluated_run("mine", ("coord_simple", "demo_wide"), value=9.0)
     (chart,) = bar_charts({0: run}, "seeded")
     (rows,) = chart.bars.values()

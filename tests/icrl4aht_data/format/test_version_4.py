@@ -97,7 +97,10 @@ def test_deep_verification_lists_values_it_cannot_check(mixed_release, lite_rele
 
 
 def test_published_files_omit_oracle_actions_and_learner_numbers(lite_release, tmp_path):
-    """Published files have no oracle actions, and number the streams of a task's learners consecutively."""
+    """Published files contain no oracle actions and no learner numbers.
+
+    `env_idx` numbers the environments of all learners of a task consecutively.
+    """
     before = load_icrl4aht(lite_release)
     to_published(before, tmp_path / "files")
     with h5py.File(tmp_path / "files" / "histories.h5") as file:

@@ -1,4 +1,4 @@
-"""Test columns of the index, data frames, filters by index fields, counts, and warnings about weak labels."""
+"""Test index columns, data frames, filters, counts, and warnings about labels of a policy that earns little."""
 
 from __future__ import annotations
 
