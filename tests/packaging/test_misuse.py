@@ -85,7 +85,7 @@ combine --out out {MINI} --data-version banana | data version 'banana': expected
 research diversity --suite empty | empty: no layout has all its populations finished; train
 train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
 train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
-collect --agent stay --layout coord_simple --source agent --out c | no history of this selection has source = 'agent': Dataset(
+collect --agent stay --layout coord_simple --source agent --out c | no history of this selection has source = 'agent'
 collect --agent stay --out c --manifest {MINI}/meta/info.json | meta/info.json, line 1: not JSON
 results none.json --out r | none.json: No such file or directory; check the path
 submit empty --out r.json --about a --data b --labels c | empty: no results in empty/tasks

@@ -218,7 +218,8 @@ def fake_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
 
 
 def test_drawn_teammates_use_stored_measurements_and_other_teammates_are_measured_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(draws_table, "read_draws", fake_draws)
+    key = ("demo_wide", "assembly_line", 0)
+    monkeypatch.setattr(draws_table, "_bundled_draws", lambda: {key: fake_draws(*key)})
     entry = sample_teammate("assembly_line", 1, "train")
     drawn = make_task("teammate", "train", "demo_wide", entry, 0)
     other = make_task("teammate", "train", "demo_wide", entry | {"theta": dict(entry["theta"], x=1)}, 1)
@@ -239,12 +240,11 @@ def test_drawn_teammates_use_stored_measurements_and_other_teammates_are_measure
 
 
 def test_nearest_test_teammate_can_be_of_another_family(monkeypatch):
-    def draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
-        (first, *_) = fake_draws(layout, family, base_seed)
-        near = replace_fields(first, other="H1/t0", other_distance=0.006)
-        return [near, replace_fields(first, theta_id=1, other_distance=0.4)]
-
-    monkeypatch.setattr(draws_table, "read_draws", draws)
+    key = ("demo_wide", "assembly_line", 0)
+    first, second = fake_draws(*key)
+    near = replace_fields(first, other="H1/t0", other_distance=0.006)
+    draws = [near, replace_fields(second, behaviour=0, other_distance=0.4)]
+    monkeypatch.setattr(draws_table, "_bundled_draws", lambda: {key: draws})
     entries = [sample_teammate("assembly_line", theta_id, "train") for theta_id in range(2)]
     tasks = [make_task("teammate", "train", "demo_wide", entry, 0) for entry in entries]
     facts = teammate_facts(tasks, Path("no artefacts"), Path("no suite"))

@@ -107,7 +107,9 @@ def test_min_expert_return_filter_selects_histories(expert_release):
     assert load_icrl4aht(expert_release).select([2, 1]).filter(min_expert_return=-1).ids.tolist() == [2, 1]
     with pytest.raises(EmptySelectionError, match=r"expert_return >= 10, the highest is 9\.5"):
         load_icrl4aht(expert_release, source="ppo", min_expert_return=10)
-    with pytest.raises(NotStoredError, match=r"2 of 8 histories; leave these histories out by ds\.select"):
+    with pytest.raises(
+        NotStoredError, match=r"of 2 of 8 histories is unknown; leave these histories out by ds\.select"
+    ):
         load_icrl4aht(expert_release, min_expert_return=0)
     known = load_icrl4aht(expert_release)
     known = known.select(known.ids[~np.isnan(known.column("expert_return"))])

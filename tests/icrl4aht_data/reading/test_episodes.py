@@ -198,7 +198,7 @@ class TestFilterFunctions:
 
     def test_faulty_filter_functions_raise_errors(self, both_sources):
         with pytest.raises(AttributeError, match="actions of a History is read from the release and cannot be set"):
-            ds[0].actions = ds[1].actions
+            both_sources[0].actions = both_sources[1].actions
         with pytest.raises(AttributeError, match="layuot"):
             both_sources.filter(lambda entry: entry.layuot == "demo_wide")
         with pytest.raises(OptionError, match=r"expected the function to return True or False, found str"):
