@@ -210,7 +210,7 @@ def diverse_tasks(track: str, split: str) -> list[Task]:
 
 def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
     """Return the draw that a teammate entry describes, or None if the table has no such draw."""
-    for draw in _bundled_draws().get((layout, teammate["family"], teammate.get("base_seed")), ()):
+    for draw in _bundled_draws().get((layout, teammate["family"], teammate.get("base_seed", -1)), ()):
         if draw.theta_id == teammate["theta_id"]:
             sampled = sample_teammate(draw.family, draw.theta_id, ranges_of(draw.base_seed), draw.base_seed)
             return draw if equal_parameters(sampled["theta"], teammate["theta"]) else None
