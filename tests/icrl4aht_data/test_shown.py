@@ -55,6 +55,7 @@ def test_repr_of_batches_shows_dtypes_and_shapes(bundled_dataset):
 SCRIPT = Path(__file__).with_name("user_script.py")
 
 
+@pytest.mark.slow
 def test_user_script_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(SCRIPT.read_text(), str(SCRIPT), "exec"), {})

@@ -160,6 +160,7 @@ def test_stored_control_results_are_reused_only_for_same_partners(compiled_progr
         )
 
 
+@pytest.mark.slow
 def test_memory_control_resets_host_agents_before_each_episode(tmp_path):
     agent, short = HostRecorder(), dataclasses.replace(FOUR, steps=5)
     evaluate_controls("host", from_host(agent), TASKS, short)
@@ -250,6 +251,7 @@ def test_next_segment_starts_with_its_own_recipes():
     assert not np.array_equal(state.env.record[0], before.env.record[0])
 
 
+@pytest.mark.slow
 def test_evaluate_command_with_controls_writes_all_results(compiled_programs, tmp_path, monkeypatch):
     monkeypatch.setattr("icrl4aht_baselines.agents.egos.find_agent", lambda name, **mode: NamedEgo(name, ego(PAID)))
     monkeypatch.setattr("icrl4aht_baselines.evaluate.evaluator.ProgramCache", lambda: compiled_programs)

@@ -95,6 +95,7 @@ def test_noise_decreases_over_episodes_and_labels_have_no_noise(release):
         assert len(set(oracle.tolist())) > 3  # oracle labels differ from the constant action of the agent
 
 
+@pytest.mark.slow
 def test_histories_can_be_labelled_by_another_agent(dataset):
     """The labelling agent receives the inputs of the recorded agent, including the actions that were taken."""
 
@@ -158,6 +159,7 @@ def test_stopped_collection_resumes_to_an_equal_release(release, teammates, tmp_
     assert (target / "MANIFEST.sha256").read_bytes() == (release / "MANIFEST.sha256").read_bytes()
 
 
+@pytest.mark.slow
 def test_swap_changes_the_teammate_every_few_episodes(release, teammates, tmp_path):
     tasks = [task for task in teammates.tasks if task.split == "train"][:2]
     chosen = teammates._replace(tasks=tasks)

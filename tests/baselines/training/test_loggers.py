@@ -121,6 +121,7 @@ def unload_library(library: str) -> None:
         del sys.modules[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
 def test_loggers_of_a_resumed_run_store_each_line_exactly_once(tmp_path, name, offline, capfd):
     pytest.importorskip("tensorboardX" if name == "tensorboard" else name)

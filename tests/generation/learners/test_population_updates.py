@@ -19,6 +19,8 @@ from icrl4aht_generation.learners.rollout import Rollout, RolloutCarry, roll_out
 from tests.helpers.populations import CONFIG, paper_multipliers, population
 from tests.helpers.trees import same_bytes
 
+pytestmark = pytest.mark.slow
+
 
 def select(tree: Any, number: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[number], tree)
@@ -83,7 +85,7 @@ def lbrdiv() -> UpdateResult:
     return second_update(LBRDiv(2))
 
 
-@pytest.fixture(params=[pytest.param("comedi", marks=pytest.mark.slow), "lbrdiv"])
+@pytest.fixture(params=["comedi", "lbrdiv"])
 def updated(request) -> UpdateResult:
     return request.getfixturevalue(request.param)
 
@@ -114,7 +116,6 @@ def test_metrics_separate_returns_of_self_play_and_cross_play(updated):
     np.testing.assert_allclose(updated.metrics["shaping"], 1 - 96 / CONFIG.shaping_horizon, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_population_update_equals_separate_updates_of_each_policy(lbrdiv, learn):
     """Compare with one separate update of each policy on the slots that it plays."""
     trained, before = lbrdiv.population, lbrdiv.before
@@ -142,7 +143,6 @@ def test_population_update_equals_separate_updates_of_each_policy(lbrdiv, learn)
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=5e-5)
 
 
-@pytest.mark.slow
 def test_shaped_rewards_are_ignored_in_slots_with_negative_weight(lbrdiv):
     trained, before = lbrdiv.population, lbrdiv.before
     lowered = np.asarray(trained._slot_weights(before.memory)).reshape(2, -1).T < 0  # shape (N, 2)
@@ -171,7 +171,6 @@ def test_lbrdiv_multipliers_follow_the_returns_of_the_environments(lbrdiv):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
-@pytest.mark.slow
 def test_comedi_starts_some_episodes_in_states_of_mixed_play(comedi):
     """The last quarter of environments starts from states that the third quarter visited in the previous roll-out."""
     source = comedi.population.assignment.starts_from

@@ -88,6 +88,7 @@ def test_page_omits_label_columns_of_histories_without_labels(tmp_path):
     assert [facts["columns"] for facts in index["histories"]] == [["rewards", "actions", "teammate_actions"]] * 2
 
 
+@pytest.mark.slow
 def test_page_of_thirty_bundled_histories_is_below_five_megabytes():
     bundled = load_icrl4aht()
     chosen = bundled.select(spread_histories(bundled, 30))

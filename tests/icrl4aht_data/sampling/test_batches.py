@@ -159,9 +159,8 @@ def test_batches_can_be_pickled_before_the_first_batch(lite):
     assert_equal_batches(next(pickle.loads(pickle.dumps(batches))), next(batches))
 
 
-@pytest.mark.parametrize(
-    "cache", [pytest.param(cache, marks=[pytest.mark.slow] * (cache != "stream")) for cache in CACHES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("cache", CACHES)
 def test_memory_use_stays_constant_over_many_batches(lite, cache):
     def resident_bytes() -> int:
         gc.collect()
