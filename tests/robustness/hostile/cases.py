@@ -304,6 +304,7 @@ add_hashed_cases(
     "Expected `int` <=", {f"large {name}": set_entry(**{name: value}) for name, value in _integers.items()}
 )
 add_hashed_cases("expected episodes of 20 steps", {"rows: 2**39": set_entry(T=2**39)})
+add_hashed_cases("the index implies", {"rows: 20 * 2**35": set_entry(T=20 * 2**35, episodes=2**35)})
 add_hashed_cases("histories", {"info: histories 2**62": change_info(histories=2**62)})
 _size = change_json(INFO, lambda value: value["shards"].update({SHARD: 2**61}))
 add_hashed_cases(r"expected 2,305,843,009,213,693,952 bytes, found \d", {"info: shard of 2**61 bytes": _size})
