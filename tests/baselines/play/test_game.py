@@ -21,6 +21,7 @@ LAYOUT = get_layout("demo_wide")
 EPISODES, STEPS = 2, 60
 
 
+@pytest.mark.slow
 def test_game_of_two_policies_has_the_returns_of_an_evaluation():
     """A game that uses the NumPy rules gives the same returns as the compiled evaluation."""
     partner = find_partner("H4/t0", LAYOUT, 1)

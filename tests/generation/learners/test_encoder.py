@@ -39,7 +39,8 @@ def with_gradient(module: WindowEncoder) -> Any:
     return jax.jit(jax.grad(weighted_sum, has_aux=True))
 
 
-@pytest.mark.parametrize("kind", ["words", pytest.param("mlp", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["words", "mlp"])
 def test_compact_inputs_give_the_features_and_gradients_of_observations(kind):
     obs = jnp.asarray(observe(LAYOUT, RECORDS, 0))
     view = CompactView(kind, (LAYOUT,))
