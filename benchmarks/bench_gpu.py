@@ -333,7 +333,8 @@ def stop_at_limit(pending: Sequence[str]) -> None:
 @click.option("--seconds", type=float, help="Least time of a measurement.  [default: 4, or 0.05 for tiny sizes]")
 def main(parts: tuple[str, ...], cases: tuple[str, ...], minutes: float, small: bool, seconds: float | None) -> None:
     """Measure the speed of learning, training and evaluation on a GPU, and print a JSON line for each case."""
-    os.environ.setdefault("XLA_CLIENT_MEM_FRACTION", "0.92")  # of the GPU's memory; the default is less
+    if "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:  # JAX accepts only one of the two names
+        os.environ.setdefault("XLA_CLIENT_MEM_FRACTION", "0.92")  # of the GPU's memory; the default is less
     pending = [name for name in CASES if (name in cases if cases else name.split("/")[0] in parts)]
     limit = Timer(60 * minutes, stop_at_limit, [pending])
     limit.daemon = True  # so that an interrupted command ends at once

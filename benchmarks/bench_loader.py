@@ -1,4 +1,4 @@
-"""Compare the loader's windows/s with two readers of the published format: `make bench-loader`.
+"""Compare the loader's windows/s with those of two readers of the published format: `make bench-loader`.
 
 All readers make the same windows of the same histories, which are bundled histories rotated by complete episodes:
 
@@ -51,7 +51,7 @@ ReadWindows = Callable[[np.ndarray, np.ndarray], dict[str, np.ndarray]]
 
 
 def published_reader(folder: Path, length: int) -> ReadWindows:
-    """Return a reader as in the published code, which reads one slice for overlapping windows and cuts it."""
+    """Return a reader like that of the published code: it reads neighbouring windows as one slice, and splits it."""
     file = h5py.File(folder / HISTORIES_H5, "r", rdcc_nbytes=512 * 2**20)
 
     def read(ids: np.ndarray, starts: np.ndarray) -> dict[str, np.ndarray]:

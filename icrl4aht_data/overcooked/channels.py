@@ -27,7 +27,7 @@ CANONICAL_CHANNELS: tuple[str, ...] = tuple(packed_channels(CANONICAL_TYPES, Tru
 
 def channel_names(layout: Layout) -> tuple[str, ...]:
     """Return the names of a layout's C own channels, in order; the docstring of `observe` explains the channels."""
-    return tuple(packed_channels(layout.ingredient_types, layout.indicates_delivery, layout))
+    return tuple(packed_channels(layout.ingredient_types, layout.indicates_delivery))
 
 
 @lru_cache(maxsize=64)

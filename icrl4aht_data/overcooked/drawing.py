@@ -214,7 +214,7 @@ def _draw_indicator(layout: Layout, canvas: Canvas, x: float, y: float, recipe: 
     _draw_counter(canvas, x, y)
     canvas.box(x, y, 0.86, 0.86, INK, 0.08)
     canvas.box(x, y, 0.74, 0.74, PAPER, 0.04)
-    _draw_trio(canvas, item_contents(layout, recipe), x, y, 0.17)
+    _draw_contents(canvas, item_contents(layout, recipe), x, y, 0.17)
 
 
 def _draw_pot(layout: Layout, canvas: Canvas, x: float, y: float, item: int, timer: int) -> None:
@@ -226,7 +226,7 @@ def _draw_pot(layout: Layout, canvas: Canvas, x: float, y: float, item: int, tim
     if timer:
         canvas.disc(x, y - 0.05, 0.38, _HEAT, 1 - timer / POT_STEPS)
     canvas.disc(x, y - 0.05, 0.31, INK)
-    _draw_trio(canvas, contents, x, y - 0.08, 0.14, empty=_STEEL)
+    _draw_contents(canvas, contents, x, y - 0.08, 0.14, empty=_STEEL)
     if timer:
         canvas.box(x, y + 0.26, 0.5, 0.34, _HEAT, 0.1)
         canvas.text(x, y + 0.26, str(timer), 0.34, _WHITE)
@@ -241,7 +241,7 @@ def _draw_button(layout: Layout, canvas: Canvas, x: float, y: float, recipe: int
     canvas.disc(x, y, 0.42, _LAMP, timer / BUTTON_STEPS)
     canvas.disc(x, y, 0.35, PAPER if timer else _STEEL)
     if timer:
-        _draw_trio(canvas, item_contents(layout, recipe), x, y, 0.15)
+        _draw_contents(canvas, item_contents(layout, recipe), x, y, 0.15)
     else:
         canvas.text(x, y, "?", 0.5, _WHITE)
 
@@ -252,12 +252,12 @@ def _draw_item(layout: Layout, canvas: Canvas, x: float, y: float, item: int, *,
     if item & PLATE:
         for part, colour in ((1, _PLATE_RIM), (0.88, _WHITE), (0.7, _PLATE_RIM), (0.62, _WHITE)):
             canvas.disc(x, y, radius * part, colour)
-        _draw_trio(canvas, contents, x, y, radius * 0.42)
+        _draw_contents(canvas, contents, x, y, radius * 0.42)
     elif contents:
         _draw_ingredient(canvas, contents[0], x, y, radius * 0.85)
 
 
-def _draw_trio(canvas: Canvas, contents: list[int], x: float, y: float, radius: float, empty=None) -> None:
+def _draw_contents(canvas: Canvas, contents: list[int], x: float, y: float, radius: float, empty=None) -> None:
     """Draw up to three ingredients in a triangle, with rings of colour `empty` for free slots."""
     for number, (dx, dy) in enumerate(((0, -0.95), (-1.02, 0.75), (1.02, 0.75))):
         centre = (x + dx * radius, y + dy * radius)

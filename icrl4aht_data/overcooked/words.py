@@ -53,7 +53,7 @@ class _Slot(NamedTuple):
 
 
 class CellWords:
-    """Vocabulary of the visible cells on one or several layouts; `cell_words` creates and caches it.
+    """All contents that a visible cell can have on one or several layouts; `cell_words` creates and caches it.
 
     Attributes:
         layouts: layouts whose observations have the same channels.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from operator import itemgetter
 from typing import TYPE_CHECKING, Self, overload
 
 import numpy as np
@@ -64,20 +65,9 @@ class FieldArrays:
     __iter__ = None
     """Disabled, since Python would otherwise iterate over items 0, 1, .., which do not exist."""
 
-    if not TYPE_CHECKING:  # type checkers would accept any name
 
-        def __getattr__(self, name: str) -> np.ndarray:
-            if name in FIELDS:
-                return self[name]
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name in FIELDS:
-            raise AttributeError(f"{name} of a {type(self).__name__} is read from the release and cannot be set")
-        super().__setattr__(name, value)
-
-    def __dir__(self) -> list[str]:
-        return [*super().__dir__(), *FIELDS]
+for _name in FIELDS:
+    setattr(FieldArrays, _name, property(itemgetter(_name)))
 
 
 class Episode(FieldArrays):

@@ -54,7 +54,9 @@ def complete_views(layout: Layout, short: np.ndarray) -> np.ndarray:
     cells = {view[:rows, :, fixed].tobytes(): cell for cell, view in enumerate(known)}
     at = np.array([cells.get(view.tobytes(), -1) for view in np.ascontiguousarray(short[..., fixed])], np.int64)
     if (at < 0).any():
-        raise PublishedFormatError(f"step {int(np.argmin(at))} does not show {layout.name} from any reachable cell")
+        raise PublishedFormatError(
+            f"the observation of step {int(np.argmin(at))} matches {layout.name} from no cell that the ego can reach"
+        )
     full = np.zeros((len(short), *layout.obs_shape), np.uint8)
     full[:, :rows] = short
     full[:, rows:, :, fixed] = known[at][:, rows:, :, fixed]

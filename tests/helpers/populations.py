@@ -30,10 +30,10 @@ def population(algorithm: Algorithm, config: PPOConfig = CONFIG, **options: Any)
     return Population(Environment(LAYOUT, max_steps=EPISODE), algorithm, config, **options)
 
 
-def paper_multipliers(
+def lbrdiv_multipliers(
     old: Multipliers, returns: np.ndarray, seen: np.ndarray, tolerance: float, rate: float
 ) -> Multipliers:
-    """Return LBRDiv's multipliers after one update by the paper's rule.
+    """Return LBRDiv's multipliers after one update by the rule of the LBRDiv paper.
 
     Entry [i, j] belongs to confederate i with best response j.
     """

@@ -160,7 +160,7 @@ def reference_command(
             raise click.UsageError(f"--bundle-as: {error}") from error
         if len(names) != 1 or {*track} != set(TRACKS) or not evaluates:
             raise click.UsageError(
-                "--bundle-as: expected one --name, all tracks and an evaluation, whose results the card states; "
+                "--bundle-as: expected one --name, all tracks and an evaluation, because the card states its results; "
                 "leave out --track and --no-evaluate"
             )
     if teacher:  # reports an invalid name now, not after hours of work

@@ -11,7 +11,7 @@ from typing import Any
 from icrl4aht_baselines.evaluate.protocols import PlannedTask
 from icrl4aht_baselines.training.run_folder import check_same_settings
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write, check_folder_content, json_hash
+from icrl4aht_data.utils.files import check_folder_content, json_hash, write_atomically
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ def result_path(out: Path, task_id: str) -> Path:
 
 
 def find_results(out: Path, planned: Sequence[PlannedTask], settings: dict[str, Any]) -> dict[str, Result]:
-    """Return task id -> stored result, for the planned tasks whose results are in a folder.
+    """Return the stored results in a folder of the planned tasks, by task id; other tasks are left out.
 
     Args:
         out: folder of results.
-        planned: tasks whose results are wanted, with the partners that the results must have.
+        planned: tasks to find results of, with the partners that the results must have.
         settings: settings that the results must have.
 
     Raises:
@@ -97,5 +97,4 @@ def write_result(out: Path, result: Result) -> None:
     """Write a task's result into a folder of results."""
     path = result_path(out, result.task_id)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as partial:
-        partial.write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
+    write_atomically(path, json.dumps(result.to_json(), indent=1) + "\n")

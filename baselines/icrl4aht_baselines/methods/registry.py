@@ -72,7 +72,7 @@ def overcooked_world(
     canonical: bool = False,
     partners: int = 0,
 ) -> World:
-    """Return the `World` that describes OvercookedV2 on layouts whose observations have the same shape.
+    """Return the description of OvercookedV2 that methods need; all layouts must have observations of one shape.
 
     Args:
         layouts: layouts of the batches.

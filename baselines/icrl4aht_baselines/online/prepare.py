@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -80,8 +80,11 @@ def prepare_play(
     # With few tasks, some teammates are in no group, so the record of training data must not state them.
     fixed = {layout for layout, _ in teammates if _fixes_dish(layout)}
     # The model imitates the searcher if it cannot see which dish is wanted.
-    unseen = [(task, task.hidden or not task.layout.shows_recipe) for group in groups for task in group]
-    played = [task._replace(searched=hidden and task.layout in fixed) for task, hidden in unseen]
+    played = [
+        task._replace(searched=task.layout in fixed and (task.hidden or not task.layout.shows_recipe))
+        for group in groups
+        for task in group
+    ]
     labels: Labels | None = "oracle" if play.imitation else None  # the searcher also acts as the oracle does
     about = {
         "model": asdict(model),
@@ -93,7 +96,7 @@ def prepare_play(
             "hide_recipe": hidden,
             "channels": "canonical",
             "obs_shape": list(observation_shape(layouts[0], True)),
-            "groups": {group[0].name: len(group) for group in groups},
+            "groups": dict(Counter(task.name for task in played)),
             "searched": sorted({task.label for task in played if task.searched}),
         },
         "trained_on": _training_record(dataset, tasks, {task.id for task in played}, labels),

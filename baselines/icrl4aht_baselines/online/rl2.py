@@ -174,7 +174,7 @@ class _Network(NamedTuple):
 
 
 class _Player:
-    """Player of tasks whose teammates share their functions: it plays their episodes in one program."""
+    """Player of tasks in one compiled program, which requires that all teammates have the same functions."""
 
     def __init__(self, tasks: Sequence[PlayTask], method: Method, play: PlayOptions, mirror: bool) -> None:
         self.tasks, self._method, self._play, self._mirror = tasks, method, play, mirror
@@ -202,8 +202,8 @@ class _Player:
         """Return the state before the first episode of all tasks."""
         env_key, change_key = jax.random.split(key)
         state = self.rollout.start(jax.random.split(env_key, len(self.tasks)))
-        memory = state.ego._replace(change=self._draw_change(change_key), partner=self._partners)
-        return state._replace(ego=memory._replace(searcher=self._new_searcher(key)))
+        change, searcher_memory = self._draw_change(change_key), self._new_searcher(key)
+        return state._replace(ego=state.ego._replace(change=change, partner=self._partners, searcher=searcher_memory))
 
     def _new_searcher(self, key: Key[Array, ""]) -> Any:
         """Return the searcher's memory at the start of every task; None if the model imitates the oracle."""
@@ -368,6 +368,8 @@ class PlayTrainer:
         self.method, self.options, self.play = method, options, play
         self.players = make_players(tasks, method, play, mirror)
         self.tasks = [task for player in self.players for task in player.tasks]
+        names = np.array([task.name for task in self.tasks])
+        self._rows = {name: np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())}
         if len(self.tasks) < play.minibatches:
             raise OptionError(
                 f"minibatches = {play.minibatches}: expected at most the {len(self.tasks)} tasks that are played at "
@@ -430,8 +432,8 @@ class PlayTrainer:
         falling = jnp.maximum(0.0, 1.0 - state.step / (self.play.imitation_end * self.options.steps))
         weight = self.play.imitation * falling
         params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
-        earned, names = jnp.concatenate(returns), np.array([task.name for task in self.tasks])
-        log |= {f"return {name}": earned[names == name].mean() for name in dict.fromkeys(names.tolist())}
+        earned = jnp.concatenate(returns)
+        log |= {f"return {name}": earned[rows].mean() for name, rows in self._rows.items()}
         return PlayState(params, optimizer, tasks, state.step + 1), log
 
     def measure(self, params: Any, episodes: int, seed: int) -> np.ndarray:

@@ -233,8 +233,8 @@ def _format_interval(value: MeanInterval | None, digits: int = 2, sign: str = ""
 def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return table 1, with a row for each agent: training data, labels, budget, and scores on each track.
 
-    An agent has a score on a track only if it played all layouts and families of the track that have headroom. A row
-    for an agent's other play mode has only scores.
+    An agent has a score on a track only if it played all layouts and families of the track that have headroom. Rows
+    such as "rl2 (greedy)", of an agent that chooses actions in its other way, have only scores.
     """
     body = []
     for agent, cells in results.items():
@@ -253,7 +253,7 @@ def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], sca
 
 
 def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
-    """Return a sentence on the difference between the two agents with the highest score N on the track teammate."""
+    """Return a sentence on the difference between the two agents with the highest score N on the track `teammate`."""
     cells = cells_with_headroom(scales, "teammate")
     scores = {agent: found.total.mean for agent, of in results.items() if (found := find_score(of, cells, scales))}
     if len(scores) < 2:

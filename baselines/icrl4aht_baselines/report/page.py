@@ -45,7 +45,7 @@ from icrl4aht_baselines.report.scores import (
 from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend, overlap_marks
 from icrl4aht_data.benchmark.facts import TRACKS, family_order
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
-from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text
+from icrl4aht_data.utils.files import json_hash, parse_json, read_text, write_atomically
 from icrl4aht_data.utils.templates import card_file, markdown_table
 from icrl4aht_data.utils.text import counted_noun
 
@@ -313,8 +313,7 @@ def write_page(
         values = _page_values(runs, episodes, notes if shown and left else [])
         text = _template_environment().get_template("page.html").render(values)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_atomically(path, text)
     return path
 
 

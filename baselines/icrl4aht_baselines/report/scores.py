@@ -221,7 +221,7 @@ def _gains_and_scales(returns: CellReturns, scale: CellScale) -> tuple[np.ndarra
 
 
 def behaviour_stratum(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
-    """Return a stratum of the bootstrap, whose units are behaviours, or seeds if there is a single behaviour.
+    """Return a stratum of the bootstrap. Its units are behaviours, or seeds if there is a single behaviour.
 
     Args:
         values: numerators of the tasks, (T, U, S).

@@ -26,7 +26,7 @@ from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.files import write_atomically
 from icrl4aht_data.utils.text import counted_noun
 
 SUBMITTED_PROTOCOL = "seeded"
@@ -239,8 +239,7 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
 
 def write_submission(path: Path, found: Submission) -> None:
     """Write a submission to a file."""
-    with atomic_write(path) as partial:
-        partial.write_bytes(msgspec.json.encode(found))
+    write_atomically(path, msgspec.json.encode(found))
 
 
 def read_submission(path: Path) -> Submission:

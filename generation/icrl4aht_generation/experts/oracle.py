@@ -230,7 +230,7 @@ class OracleView:
 
     @cached_property
     def teammate_pots(self) -> Bool[Array, " P"]:
-        """Pots that the ego leaves to the teammate: the pot whose soup of the current recipe is done first.
+        """Pots that the ego leaves to the teammate: the pot that is first to have a soup of the current recipe.
 
         The ego leaves no pot to a teammate that does not cook or is idle.
         """

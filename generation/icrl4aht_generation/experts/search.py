@@ -150,7 +150,7 @@ def _begun_dish(state: State) -> Int[Array, " 3"]:
     If it carries no soup, count the fullest pot and the ingredient in the ego's hand, if that pot has room for it.
     """
     hand, counts = state.hands[EGO], ingredient_count(state.pot_items)
-    in_hand = Scene.ingredient_counts(hand & np.uint8(0xFF - COOKED))
-    in_pot = Scene.ingredient_counts(state.pot_items[jnp.argmax(counts)] & np.uint8(0xFF - COOKED))
+    in_hand = Scene.ingredient_counts(hand)
+    in_pot = Scene.ingredient_counts(state.pot_items[jnp.argmax(counts)])
     adds = (hand & PLATE == 0) & (counts.max() < 3)
     return jnp.where(hand & COOKED > 0, in_hand, in_pot + jnp.where(adds, in_hand, 0))

@@ -36,7 +36,7 @@ def run_on_ray(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueO
         remote = ray.remote(
             num_cpus=1,
             num_gpus=int(accelerated),
-            max_calls=1,  # every job has a new process, whose end releases the memory
+            max_calls=1,  # a new process for every job; when it ends, its memory is released
             max_retries=options.retries,
             retry_exceptions=True,
         )(run_in_worker)

@@ -27,7 +27,7 @@ from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEg
 from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.files import atomic_write, read_text
+from icrl4aht_data.utils.files import read_text, write_atomically
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.resume import software_versions
@@ -162,8 +162,7 @@ def cached_measurement(path: Path, settings: dict[str, Any], kind: type[T], meas
     except (IndexFormatError, KeyError, TypeError, msgspec.MsgspecError):
         pass  # the file is missing, damaged or from another version
     measured = measure()
-    with atomic_write(path) as partial:
-        partial.write_bytes(msgspec.json.encode({"settings": settings, "measured": measured}))
+    write_atomically(path, msgspec.json.encode({"settings": settings, "measured": measured}))
     return measured
 
 

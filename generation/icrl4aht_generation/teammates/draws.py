@@ -24,7 +24,7 @@ from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice, unknown_name
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import atomic_write, read_lines
+from icrl4aht_data.utils.files import read_lines, write_atomically
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
 
@@ -311,5 +311,4 @@ def read_measured(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
 def write_table(path: Path, rows: Iterable[Any]) -> None:
     """Write one JSON line for each row, sorted by the rows' `order`."""
     lines = [msgspec.json.encode(row) + b"\n" for row in sorted(rows, key=lambda row: row.order)]
-    with atomic_write(path) as partial:
-        partial.write_bytes(b"".join(lines))
+    write_atomically(path, b"".join(lines))

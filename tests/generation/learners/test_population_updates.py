@@ -16,7 +16,7 @@ from icrl4aht_generation.learners.population.population import Algorithm, Popula
 from icrl4aht_generation.learners.ppo import sequences, shaping_weight
 from icrl4aht_generation.learners.rollout import Rollout, RolloutCarry, roll_out
 
-from tests.helpers.populations import CONFIG, paper_multipliers, population
+from tests.helpers.populations import CONFIG, lbrdiv_multipliers, population
 from tests.helpers.trees import same_bytes
 
 pytestmark = pytest.mark.slow
@@ -166,7 +166,7 @@ def test_lbrdiv_multipliers_follow_the_returns_of_the_environments(lbrdiv):
     for left, right in product((2, 3), (0, 1)):
         env[left, right] = returns[(assignment.policy[0] == left) & (assignment.policy[1] == right)].mean()
         seen[left, right] = True
-    expected = paper_multipliers(lbrdiv.before.memory, env, seen, 0.1, 0.01)
+    expected = lbrdiv_multipliers(lbrdiv.before.memory, env, seen, 0.1, 0.01)
     for name, one, other in zip(Multipliers._fields, lbrdiv.after.memory, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6, err_msg=name)
 

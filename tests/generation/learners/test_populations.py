@@ -17,7 +17,7 @@ from icrl4aht_generation.learners.population.fcp import FCP
 from icrl4aht_generation.learners.population.lbrdiv import LBRDiv, Multipliers
 
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
-from tests.helpers.populations import paper_multipliers, population
+from tests.helpers.populations import lbrdiv_multipliers, population
 
 
 def test_each_fcp_member_plays_both_agents():
@@ -202,7 +202,7 @@ def test_lbrdiv_multipliers_follow_the_update_of_the_paper():
     for share in (0.0, 0.2, 0.5, 0.0, 0.5, 0.9, 1.0):
         returns, seen = random_returns(k, rng, share)
         found = adapt(found, returns, seen)
-        expected = paper_multipliers(expected, returns, seen, 0.3, 0.05)
+        expected = lbrdiv_multipliers(expected, returns, seen, 0.3, 0.05)
         for name, one, other in zip(Multipliers._fields, found, expected, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4, err_msg=name)
         for multipliers in found[:2]:

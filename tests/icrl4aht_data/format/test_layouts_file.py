@@ -1,4 +1,4 @@
-"""Test releases that store their own layouts, and tasks that fix the recipes."""
+"""Test releases that store their own layouts, and tasks whose recipes replace those of the layout."""
 
 from __future__ import annotations
 

@@ -118,7 +118,9 @@ def test_short_views_that_match_no_position_are_refused(short_views, tmp_path):
     with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
         stored: Any = file["/1/obs"]
         stored[7] = 0
-    with pytest.raises(PublishedFormatError, match="group /1: obs: step 7 does not show cramped_up from any reachable"):
+    with pytest.raises(
+        PublishedFormatError, match="group /1: obs: the observation of step 7 matches cramped_up from no cell"
+    ):
         from_published(tmp_path / "files", tmp_path / "out", kept_steps=20)
 
 
