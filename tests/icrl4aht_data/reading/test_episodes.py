@@ -197,7 +197,7 @@ class TestFilterFunctions:
             both_sources.filter("demo_wide")
 
     def test_faulty_filter_functions_raise_errors(self, both_sources):
-        with pytest.raises(AttributeError, match="property .*of 'History' object has no setter"):
+        with pytest.raises(AttributeError, match=r"property .*of 'History' object has no setter"):
             both_sources[0].actions = both_sources[1].actions
         with pytest.raises(AttributeError, match="layuot"):
             both_sources.filter(lambda entry: entry.layuot == "demo_wide")
