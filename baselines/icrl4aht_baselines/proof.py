@@ -143,7 +143,7 @@ class ProofJob(TrainingJob):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All settings that the result depends on, as JSON, except the content of the release."""
+        """All settings that the result depends on, as JSON. The content of the release is not included."""
         tasks = {name: [task.task_id for task in own] for name, own in self.options.tasks.items()}
         return {"train": asdict(self.training), "root": self.options.root, "tasks": tasks, "first": self.first}
 

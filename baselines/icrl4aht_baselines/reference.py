@@ -1,14 +1,12 @@
-"""Make the reference models, from a release of noise histories to evaluated models and their cards.
+"""Make the reference models, from a release of scripted histories to evaluated models and their cards.
 
-    OUT/noise/lite              release of noise histories, as `icrl4aht-data generate --profile noise` makes it
-    OUT/rl2-reference-TRACK     RL^2, trained by playing with the training teammates of that release
-    OUT/agent-TRACK             histories of RL^2 with falling noise, source `agent`
-    OUT/rising-TRACK            histories of RL^2 that begin with random actions, see `RL2_HISTORIES`
-    OUT/NAME-TRACK              run folder of the model NAME
-    OUT/NAME-TRACK-first        run folder of the first of two training runs of a model
-    OUT/NAME-TRACK-own          histories that this first model plays, labelled by RL^2
-    OUT/NAME-TRACK-mixed        the histories of the first training together with the model's histories
-    OUT/results/NAME-TRACK/...  results on validation tasks and on test tasks
+    OUT/PROFILE/lite                    release that `icrl4aht-data generate --profile PROFILE` makes
+    OUT/agent-TRACK[-TEACHER]           histories of RL^2 with falling noise, source `agent`, see `RL2_HISTORIES`
+    OUT/NAME-TRACK-sSEED/run            run folder of the model NAME
+    OUT/NAME-TRACK-sSEED/first          run folder of the first of two training runs of a model
+    OUT/NAME-TRACK-sSEED/own            histories that this first model plays, labelled by RL^2
+    OUT/NAME-TRACK-sSEED/mixed          the histories of the first training together with the model's histories
+    OUT/NAME-TRACK-sSEED/results/KIND   results on validation tasks and on test tasks
 
 Finished parts are reused, and stopped parts resume.
 """
@@ -19,12 +17,15 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
+from msgspec import to_builtins
 
-from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS
+from icrl4aht_baselines.agents.bundled import EVERY_TRACK, MODEL_CARD, MODELS, format_track
 from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
@@ -33,27 +34,21 @@ from icrl4aht_baselines.online.prepare import prepare_play
 from icrl4aht_baselines.report.page import instances_range, markdown_sections
 from icrl4aht_baselines.report.results import EvaluationRun, ResultSource, evaluate_agent, merge, read_run
 from icrl4aht_baselines.training.histories import prepare, start_from
-from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
+from icrl4aht_baselines.training.job import TrainingJob
+from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
 from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend
-from icrl4aht_baselines.training.trainer import show_steps
-from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, KEPT_STEPS, TRACKS
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.files import process_lock
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.templates import fill_template
 from icrl4aht_data.writing.combine import combine_releases
 
-PROFILE = "noise"
-"""Name of the profile that the release of noise histories is generated with."""
-
-RL2_HISTORIES = {
-    "agent": NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8)),
-    "rising": NoiseConfig(8, 40, start=(0.8, 1.0), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.4, 0.9)),
-}
-"""Kind of data -> noise of the histories that RL^2 plays with each teammate. Every history ends without noise. Those of
-the kind `rising` begin with mostly random actions, like a learner, for a model that imitates the improvement."""
+RL2_HISTORIES = NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8))
+"""Number and noise of the histories that RL^2 plays with each teammate. Every history ends without noise."""
 
 OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
 """Noise and number of the histories that a model itself plays for its second training: 1 in 9 of all episodes."""
@@ -70,6 +65,7 @@ EVALUATIONS = {
 """Name of a folder of results -> split of the tasks, protocol, and number of seeds."""
 
 TRACK_VIEWS: dict[str, dict[str, Any]] = {
+    EVERY_TRACK: {},
     "teammate": {},
     "layout": {"mirror": True, "hide_recipe": ("asymm_both",)},
 }
@@ -78,6 +74,7 @@ they are also trained on mirrored games. On the test layout asymm_right the ego 
 indicator of the training layout asymm_both is hidden."""
 
 TRACK_PLAY: dict[str, dict[str, Any]] = {
+    EVERY_TRACK: {},
     "teammate": {},
     "layout": {"rearranged": 70, "four_recipes": True},
 }
@@ -90,10 +87,14 @@ class Recipe:
 
     Attributes:
         method: name of the method.
-        data: kind of the training histories, one of `RL2_HISTORIES`; empty for learning by playing.
+        plays: whether the model learns by playing, not from histories that `rl2-reference` plays.
         model: values of `ModelOptions`.
         train: values of `TrainOptions`.
         histories: values of `HistoryOptions`.
+        play: values of `PlayOptions`.
+        profile: profile of the release that names the training teammates.
+        start: bundled model whose parameters for track `teammate` the training starts from; empty for random ones.
+        one_model: whether the same model plays all tracks, see `EVERY_TRACK`.
         own_round: whether a second training run follows, on the first histories and on histories that the model itself
             plays and RL^2 labels.
         greedy: whether the model takes its most probable actions or samples its actions.
@@ -101,50 +102,41 @@ class Recipe:
     """
 
     method: str
-    data: str = ""
+    plays: bool = False
     model: dict[str, Any] = field(default_factory=dict)
     train: dict[str, Any] = field(default_factory=dict)
     histories: dict[str, Any] = field(default_factory=dict)
+    play: dict[str, Any] = field(default_factory=dict)
+    profile: str = "noise"
+    start: str = ""
+    one_model: bool = False
     own_round: bool = False
     greedy: bool = False
     role: str = ""
+
+    @property
+    def tracks(self) -> tuple[str, ...]:
+        """Names of the tracks that have a model of their own."""
+        return (EVERY_TRACK,) if self.one_model else tuple(TRACKS)
 
 
 _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
 _STEPS: dict[str, Any] = {"steps": 4000, "batch_size": 16, "context": 200, "learning_rate": 2e-3}
 # With K + 1 queries, each prefix of a context of K transitions has its own query.
 _QUERIES: dict[str, Any] = {"labels": "expert", "queries": _STEPS["context"] + 1}
-_LONG: dict[str, Any] = {**_STEPS, "steps": 3000, "batch_size": 4, "context": 1000}
 
 RECIPES = {
     "rl2-reference": Recipe(
-        "rl2", "", RL2_SETTINGS["model"], {**RL2_SETTINGS["train"], "steps": 1600}, role="plays best"
+        "rl2", True, RL2_SETTINGS["model"], {**RL2_SETTINGS["train"], "steps": 1600}, role="plays best"
     ),
     "ad-reference": Recipe(
-        "ad", "agent", _TINY, _STEPS, {"labels": "expert"}, own_round=True, greedy=True, role="best of AD"
+        "ad", False, _TINY, _STEPS, {"labels": "expert"}, own_round=True, greedy=True, role="best of AD"
     ),
     "dpt-reference": Recipe(
-        "dpt", "agent", _TINY, {**_STEPS, "steps": 2000}, _QUERIES, own_round=True, role="best of DPT"
+        "dpt", False, _TINY, {**_STEPS, "steps": 2000}, _QUERIES, own_round=True, role="best of DPT"
     ),
-    "ad-rising": Recipe("ad", "rising", _TINY, _LONG, role="gains most by its memory"),
 }
 """Name of a reference model -> how it is made. The bundled models have the same names."""
-
-
-class ReferenceOutcome(NamedTuple):
-    """Outcome of one reference model on one track.
-
-    Attributes:
-        name: name in `RECIPES`.
-        track: name of the track.
-        run: run folder of the model.
-        results: name in `EVALUATIONS` -> folder of results.
-    """
-
-    name: str
-    track: str
-    run: Path
-    results: dict[str, Path]
 
 
 def check_learns_from_teacher(name: str) -> None:
@@ -153,61 +145,97 @@ def check_learns_from_teacher(name: str) -> None:
     Raises:
         OptionError: if the model learns by playing.
     """
-    if not RECIPES[name].data:
-        taught = ", ".join(each for each, recipe in RECIPES.items() if recipe.data)
+    if RECIPES[name].plays:
+        taught = ", ".join(each for each, recipe in RECIPES.items() if not recipe.plays)
         raise OptionError(
             f"{name} does not learn from a teacher's histories; leave out --teacher, or choose another --name: {taught}"
         )
 
 
 @dataclass(frozen=True)
-class ReferenceMaker:
-    """Maker of the reference models of a track. Models and releases that exist already are reused.
+class ReferenceJob(TrainingJob):
+    """Job that trains a reference model for a track. Existing releases are reused.
 
     Attributes:
-        track: name of the track.
-        out: output folder; its content is described at the top of this module.
-        show: function for progress, called with (description, units done, total units, note).
+        model: name in `RECIPES`.
+        track: name of the track, or `EVERY_TRACK`.
+        seed: seed of the training runs.
+        out: folder of all jobs, with the content that the top of this module describes.
         teacher: name or run folder of the agent that plays and labels the histories, such as `rl2-reference`; if None,
-            RL^2 is trained first. Existing releases and runs are reused, even if made with another teacher.
+            RL^2 is trained first.
     """
 
+    model: str
     track: str
+    seed: int
     out: Path
-    show: Callable[..., None]
     teacher: str | None = None
 
-    def make(self, name: str, evaluates: bool = True) -> ReferenceOutcome:
-        """Make a reference model with everything that it needs, or resume a stopped call.
+    @property
+    def name(self) -> str:
+        """Name of the job's folder."""
+        return f"{self.model}-{self.track}-s{self.seed}"
 
-        Args:
-            name: a name in `RECIPES`.
-            evaluates: whether the model is also evaluated.
+    @property
+    def label(self) -> str:
+        """Name of the job for progress displays."""
+        return f"{self.model}, {format_track(self.track)}, seed {self.seed}"
 
-        Raises:
-            OptionError: if a run folder holds a run with other settings. Existing releases are not checked.
-            TrainingStopped: after SIGTERM or SIGINT during training; the state of the training is saved.
-        """
-        recipe, run = RECIPES[name], self.out / f"{name}-{self.track}"
-        if not recipe.data:
-            self.train_by_playing()
-        else:
-            histories, first = self.teacher_histories(recipe.data), None
-            if recipe.own_round:
-                first = run.with_name(f"{run.name}-first")
-                self.train(recipe, histories, first)
-                histories = self.add_own_histories(histories, first, run)
-            self.train(recipe, histories, run, before=first)
-        return ReferenceOutcome(name, self.track, run, self.evaluate(name, run, recipe) if evaluates else {})
+    @property
+    def recipe(self) -> Recipe:
+        """How the model is made."""
+        return RECIPES[self.model]
 
-    def noise_release(self) -> Path:
-        """Generate the release of noise histories. Return the folder of the release."""
-        folder = self.out / "noise"
-        if not (folder / "lite").is_dir():
-            command = ["-m", "icrl4aht_data", "generate", "--profile", PROFILE, "--out", str(folder)]
-            failed = subprocess.run([sys.executable, *command], check=False).returncode
-            if failed:
-                raise OptionError(f"{folder}: `python {' '.join(command)}` failed; its messages are above")
+    @property
+    def training(self) -> TrainOptions:
+        """Settings of a training run, for the trainer."""
+        return TrainOptions(**self.recipe.train, seed=self.seed)
+
+    @property
+    def updates(self) -> int:
+        """Number of training steps of all training runs."""
+        return self.training.steps * (1 + self.recipe.own_round)
+
+    @property
+    def steps_per_update(self) -> int:
+        """Number of environment or history steps of a training step, approximate if the model plays."""
+        played = PlayOptions(**self.recipe.play).episodes * KEPT_STEPS
+        return self.training.batch_size * (played if self.recipe.plays else self.training.context)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All settings that the result depends on, as JSON. The content of releases is not included."""
+        views, play = TRACK_VIEWS[self.track], TRACK_PLAY[self.track]
+        data = {"teacher": self.teacher, "noise": (RL2_HISTORIES, OWN_HISTORIES)}
+        code = {"code_version": version("icrl4aht-data")}
+        return to_builtins({"recipe": self.recipe, "views": views, "play": play, **data, **code})
+
+    def runs(self) -> list[tuple[Path, int]]:
+        """Return the folders of the training runs, last one first, with the number of earlier training steps."""
+        return [(self.run_folder, self.updates - self.training.steps), (self.folder / "first", 0)]
+
+    def measure(self, on_update: OnUpdate) -> dict[str, Any]:
+        """Train the model with everything that it needs. Return no values."""
+        if self.recipe.plays:
+            self.train_by_playing(on_update)
+            return {}
+        histories, first = self.teacher_histories(), None
+        if self.recipe.own_round:
+            first = self.folder / "first"
+            self.train(histories, first, on_update)
+            histories = self.add_own_histories(histories, first)
+        self.train(histories, self.run_folder, on_update, before=first)
+        return {}
+
+    def generated_release(self, profile: str) -> Path:
+        """Generate the release of a profile. Return the folder of the release."""
+        folder = self.out / profile
+        with process_lock(self.out / f".{profile}.generating.lock"):
+            if not (folder / "lite").is_dir():
+                command = ["-m", "icrl4aht_data", "generate", "--profile", profile, "--out", str(folder)]
+                failed = subprocess.run([sys.executable, *command], check=False).returncode
+                if failed:
+                    raise OptionError(f"{folder}: `python {' '.join(command)}` failed; run it to see the reason")
         return folder / "lite"
 
     def teammates(self, number: int = 0) -> Any:
@@ -216,77 +244,90 @@ class ReferenceMaker:
         Args:
             number: number of the collection, which determines the seeds of the tasks, see `release_teammates`.
         """
-        noise = load_icrl4aht(self.noise_release(), layout=list(TRACKS[self.track]["train"]))
+        noise = load_icrl4aht(self.generated_release("noise"), layout=list(TRACKS[self.track]["train"]))
         return release_teammates(noise, number, self.diverse_tasks())
 
     def diverse_tasks(self) -> list[Task]:
-        """Return the bundled training tasks of the track with diverse teammates."""
-        return read_tasks(manifest_path(self.track, "train", "diverse"))
+        """Return the bundled training tasks of the track with diverse teammates; none for `EVERY_TRACK`."""
+        return [] if self.track == EVERY_TRACK else read_tasks(manifest_path(self.track, "train", "diverse"))
 
-    def train_by_playing(self) -> Path:
-        """Train RL^2 by playing with teammates of the noise histories and diverse teammates. Return the run folder."""
-        recipe, folder = RECIPES["rl2-reference"], self.out / f"rl2-reference-{self.track}"
-        options = TrainOptions(**recipe.train)
-        root = str(self.noise_release())
-        choice = HistoryOptions(TRACKS[self.track]["train"], root, **TRACK_VIEWS[self.track])
-        model, play = ModelOptions(**recipe.model), PlayOptions(**TRACK_PLAY[self.track])
-        job = prepare_play(recipe.method, model, options, play, choice, self.diverse_tasks())
-        job.train(folder, done=show_steps(self.show, folder.name, options.steps))
+    def train_by_playing(self, on_update: OnUpdate) -> None:
+        """Train RL^2 by playing with the teammates of a release and of `diverse_tasks`."""
+        recipe, root = self.recipe, str(self.generated_release(self.recipe.profile))
+        layouts = (ALL_LAYOUTS,) if recipe.one_model else TRACKS[self.track]["train"]
+        choice = HistoryOptions(layouts, root, **TRACK_VIEWS[self.track])
+        model, play = ModelOptions(**recipe.model), PlayOptions(**TRACK_PLAY[self.track], **recipe.play)
+        job = prepare_play(recipe.method, model, self.training, play, choice, self.diverse_tasks())
+        params = start_from(MODELS / recipe.start / "teammate", job.method, job.about) if recipe.start else None
+        job.train(self.run_folder, params=params, done=self.step_progress(on_update))
+
+    def trained_teacher(self) -> str | Path:
+        """Return the teacher, which is trained first if it is not given."""
+        if self.teacher:
+            return self.teacher
+        job = ReferenceJob("rl2-reference", self.track, 0, self.out)
+        job.run(wait=True)
+        return job.run_folder
+
+    def teacher_histories(self) -> Path:
+        """Record histories of the teacher, with noise as in `RL2_HISTORIES`. Return the folder of the release."""
+        folder = self.out / "-".join(["agent", self.track, *([Path(self.teacher).name] if self.teacher else [])])
+        with process_lock(folder.with_name(f".{folder.name}.recording.lock")):
+            if not folder.is_dir():
+                collect_release(
+                    find_agent(self.trained_teacher(), greedy=False), self.teammates(), RL2_HISTORIES, folder
+                )
         return folder
 
-    def teacher_histories(self, kind: str) -> Path:
-        """Record histories of the teacher, with noise as in `RL2_HISTORIES[kind]`. Return the folder of the release."""
-        folder = self.out / f"{kind}-{self.track}"
-        if not folder.is_dir():
-            agent = find_agent(self.teacher or self.train_by_playing(), greedy=False)
-            collect_release(agent, self.teammates(), RL2_HISTORIES[kind], folder, progress=self.show)
-        return folder
-
-    def train(self, recipe: Recipe, root: Path, folder: Path, before: Path | None = None) -> None:
+    def train(self, root: Path, folder: Path, on_update: OnUpdate, before: Path | None = None) -> None:
         """Train a model on a release; with `before`, start from that run's parameters, at a lower learning rate."""
-        options = TrainOptions(**recipe.train)
+        options = self.training
         if before:
             options = replace(options, learning_rate=OWN_SHARE * options.learning_rate)
-        views = {**recipe.histories, **TRACK_VIEWS[self.track]}
+        views = {**self.recipe.histories, **TRACK_VIEWS[self.track]}
         histories = HistoryOptions(TRACKS[self.track]["train"], str(root), channels="canonical", **views)
-        job = prepare(recipe.method, ModelOptions(**recipe.model), options, histories)
+        job = prepare(self.recipe.method, ModelOptions(**self.recipe.model), options, histories)
         params = start_from(before, job.method, job.about) if before else None
-        job.train(folder, params=params, done=show_steps(self.show, folder.name, options.steps))
+        job.train(folder, params=params, done=self.step_progress(on_update, options.steps if before else 0))
 
-    def add_own_histories(self, histories: Path, first: Path, run: Path) -> Path:
+    def add_own_histories(self, histories: Path, first: Path) -> Path:
         """Record histories of a model, labelled by the teacher. Return a release that adds them to `histories`."""
-        own, mixed = (run.with_name(f"{run.name}-{kind}") for kind in ("own", "mixed"))
+        own, mixed = self.folder / "own", self.folder / "mixed"
         if not mixed.is_dir():
             if not own.is_dir():
-                labeller = find_agent(self.teacher or self.train_by_playing())
                 teammates, agent = self.teammates(number=1), find_agent(first, greedy=False)
-                collect_release(agent, teammates, OWN_HISTORIES, own, labeller=labeller, progress=self.show)
+                collect_release(agent, teammates, OWN_HISTORIES, own, labeller=find_agent(self.trained_teacher()))
             combine_releases(mixed, [histories, own])
         return mixed
 
-    def evaluate(self, name: str, run: Path, recipe: Recipe) -> dict[str, Path]:
-        """Evaluate a model. Return the folder of results for each name in `EVALUATIONS`."""
-        model, agent = f"{name}-{self.track}", find_agent(run, greedy=recipe.greedy)._replace(name=name)
-        found = {kind: self.out / "results" / model / kind for kind in EVALUATIONS}
+    def evaluation_tasks(self, split: str) -> list[Task]:
+        """Return the tasks of a split on the track, or on all tracks; the split "diverse" has only published tracks."""
+        published = tuple(TRACKS) if split == "diverse" else ALL_TRACKS
+        tracks = published if self.track == EVERY_TRACK else (self.track,)
+        return [task for track in tracks for task in bundled_tasks(track, split)]
+
+    def results(self, kind: str) -> Path:
+        """Return the folder of the results with a name in `EVALUATIONS`."""
+        return self.folder / "results" / kind
+
+    def evaluate(self, show: Callable[..., None]) -> None:
+        """Evaluate the trained model, with the function `show` for progress."""
+        agent = find_agent(self.run_folder, greedy=self.recipe.greedy)._replace(name=self.model)
         for kind, (split, protocol, seeds) in EVALUATIONS.items():
-            tasks, shown = bundled_tasks(self.track, split), {"show": self.show, "what": f"{model}, {kind}"}
-            evaluate_agent(agent, tasks, get_protocol(protocol), found[kind], seeds=range(seeds), **shown)
-        return found
+            shown: Any = {"seeds": range(seeds), "show": show, "what": f"{self.name}, {kind}"}
+            evaluate_agent(agent, self.evaluation_tasks(split), get_protocol(protocol), self.results(kind), **shown)
 
 
-def write_bundled_card(
-    name: str, outcomes: Sequence[ReferenceOutcome], folder: Path = MODELS, teacher: str | None = None
-) -> Path:
+def write_bundled_card(name: str, jobs: Sequence[ReferenceJob], folder: Path = MODELS) -> Path:
     """Write the card of a bundled model, with its training and its results. Return the path of the card.
 
     Args:
         name: name of the bundled model.
-        outcomes: evaluated outcomes of the model's tracks.
+        jobs: finished and evaluated jobs of the model, one for each track.
         folder: folder of the bundled models.
-        teacher: agent that played the training histories, see `ReferenceMaker`.
     """
-    (run,) = merge([read_run(found.results["test-seeded"]) for found in outcomes])
-    validation = merge([read_run(found.results[kind]) for found in outcomes for kind in ("validation", "diverse")])
+    (run,) = merge([read_run(job.results("test-seeded")) for job in jobs])
+    validation = merge([read_run(job.results(kind)) for job in jobs for kind in ("validation", "diverse")])
     trained = [source for source in run.sources if source.trained]
     models = grouped(trained, lambda source: (source.trained or {})["run_hash"])  # the table has a row for each model
     configs: list[dict[str, Any]] = [(sources[0].trained or {})["config"] for sources in models.values()]
@@ -298,16 +339,16 @@ def write_bundled_card(
         "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
         *overlap_legend(overlaps),
     ]
-    taught = f" --teacher {teacher}" if teacher else ""
-    command = f"icrl4aht-data research reference --name {outcomes[0].name}{taught} --bundle-as {name}"
+    taught = f" --teacher {jobs[0].teacher}" if jobs[0].teacher else ""
+    command = f"icrl4aht-data research reference --name {jobs[0].model}{taught} --bundle-as {name}"
     properties = [
         f"| method | {config['method']} |",
         f"| created with | icrl4aht-data {config['package_version']} |",
         f"| made by | `{command}` |",
     ]
     sections = [section for one in (run, *validation) for section in markdown_sections([one], one.protocol)]
-    drawn = [found.track for found in outcomes if (folder / name / found.track / RUN_CURVES).is_file()]
-    shown = [f"Training of the model of track {track}:\n\n![curves]({track}/{RUN_CURVES})" for track in drawn]
+    drawn = [job.track for job in jobs if (folder / name / job.track / RUN_CURVES).is_file()]
+    shown = [f"Training of the model of {format_track(track)}:\n\n![curves]({track}/{RUN_CURVES})" for track in drawn]
     text = fill_template(
         "baseline.md",
         title=name,

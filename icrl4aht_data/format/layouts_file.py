@@ -34,6 +34,11 @@ OTHER = "other"
 _GENERATED = re.compile(r"(\w+)-(\d+)-(\d+)", re.ASCII).fullmatch
 
 
+def is_generated(name: str) -> bool:
+    """Return whether a name has the form of names of generated layouts, such as templates-0-17."""
+    return _GENERATED(name) is not None
+
+
 def layout_family(name: str) -> str:
     """Return the family of a layout: `PUBLISHED`, the family in the name of a generated layout, or `OTHER`."""
     return PUBLISHED if name in LAYOUTS else _origin(name)[0]
@@ -47,11 +52,11 @@ def read_layouts(root: Path) -> dict[str, Layout]:
             cannot be delivered, or if family, seed and number differ from those in the name. The message has the file
             and the line number.
     """
-    return _read_layouts_file(resolve_inside(root, LAYOUTS_FILE))
+    return read_layouts_file(resolve_inside(root, LAYOUTS_FILE))
 
 
-def _read_layouts_file(path: Path) -> dict[str, Layout]:
-    """Return the layouts of a file, see `read_layouts`; no layouts if the file does not exist."""
+def read_layouts_file(path: Path) -> dict[str, Layout]:
+    """Return the layouts of a file by name, see `read_layouts`; no layouts if the file does not exist."""
     layouts: dict[str, Layout] = {}
     for number, line in enumerate(read_lines(path) if path.is_file() else (), start=1):
         try:
@@ -88,7 +93,7 @@ def read_tasks_and_layouts(path: Path) -> list[Task]:
         TaskFormatError: if a task is malformed; the message names the file and the line.
         IndexFormatError: if the file of layouts is malformed, see `read_layouts`.
     """
-    _read_layouts_file(path.with_name(LAYOUTS_NAME))
+    read_layouts_file(path.with_name(LAYOUTS_NAME))
     return read_tasks(path)
 
 

@@ -127,7 +127,10 @@ class Layout:
 
     @cached_property
     def ingredients(self) -> tuple[int, ...]:
-        """Ids of the ingredients that have a pile, ascending; bits 2 + 2k and 3 + 2k of an item byte count the k-th."""
+        """Ids of the ingredients that have a pile, in ascending order.
+
+        Bits 2 + 2k and 3 + 2k of an item byte are the number of pieces of `ingredients[k]`.
+        """
         return tuple(sorted({int(c) for c in "".join(self.rows) if c in digits}))
 
     @cached_property

@@ -49,7 +49,7 @@ _KINDS = {"wall": WALL, "goal": GOAL, "pot": POT, "recipe_indicator": INDICATOR,
 
 
 class ChannelBits(NamedTuple):
-    """Place of each observation channel in the two packed words of a visible cell.
+    """Bit position of each observation channel in the two packed words of a visible cell.
 
     Attributes:
         shift: uint32 (C,), lowest bit of each channel in the packed word.

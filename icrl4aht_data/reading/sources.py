@@ -278,9 +278,9 @@ HistorySource = FlatSource | StreamedSource
 
 
 def _read_in_threads(read: Callable[[ReadRequest], None], requests: Sequence[ReadRequest], threads: int) -> None:
-    """Call `read` with parts of the requests, on several threads if there are enough steps.
+    """Call `read` with parts of the requests, in several threads if there are enough steps.
 
-    Each thread gets the same histories of every request, so windows that share chunks are read by one thread.
+    All requests are divided at the same shares of their rows, so one thread usually reads windows that share chunks.
     """
     rows, steps = max((request.out.shape[:2] for request in requests), key=lambda shape: shape[1])
 

@@ -364,7 +364,7 @@ NO_ROOM = (*FULL, errno.EFBIG)
 
 
 def describe_disk(path: Path) -> str:
-    """Return text with the free space of the disk of a path, which need not exist."""
+    """Return text that states the free space on the disk of a path. The path need not exist."""
     folder = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists()).resolve()
     disk = next(parent for parent in (folder, *folder.parents) if parent.is_mount() or parent == parent.parent)
     usage = shutil.disk_usage(folder)

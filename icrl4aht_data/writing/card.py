@@ -228,7 +228,7 @@ def _range_text(values: Iterable[float]) -> str:
 
 
 def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return the file patterns of the configurations of the Hub's viewer, by configuration name and split."""
+    """Return configuration -> split -> pattern of file names, for the dataset viewer of the Hugging Face Hub."""
     patterns = {"default": f"{PARQUET_INDEX}/*/{{}}.parquet"}
     patterns |= {entry.layout: f"{PARQUET_INDEX}/{entry.layout}/{{}}.parquet" for entry in entries}
     patterns |= {PARQUET_EPISODES: f"{PARQUET_EPISODES}/*/{{}}-*.parquet"}

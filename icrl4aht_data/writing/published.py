@@ -61,7 +61,7 @@ def to_published(
     overwrite: bool = False,
     advance: HistoryProgress = lambda done, total: None,
 ) -> Path:
-    """Write a selection as files of the published code, with histories numbered from 0.
+    """Write a selection of histories in the file format of the paper's code, with history ids from 0.
 
     Args:
         dataset: a release, or a selection of its histories.

@@ -1,4 +1,4 @@
-"""Test training models on a release to show what they learn: jobs, stored returns, and the card's table."""
+"""Test `research proof`, which trains models on a release: its jobs, stored returns, and table in the dataset card."""
 
 from __future__ import annotations
 

@@ -10,19 +10,20 @@ from typing import Any
 import pytest
 from icrl4aht_baselines import reference
 from icrl4aht_baselines.agents import bundled
-from icrl4aht_baselines.agents.bundled import MODELS, bundled_models
+from icrl4aht_baselines.agents.bundled import EVERY_TRACK, MODELS, bundled_models
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
-from icrl4aht_baselines.reference import RECIPES, RL2_HISTORIES, ReferenceMaker, ReferenceOutcome
+from icrl4aht_baselines.reference import RECIPES, RL2_HISTORIES, ReferenceJob
 from icrl4aht_baselines.report.results import EvaluationRun
 from icrl4aht_baselines.training import trainer
 from icrl4aht_baselines.training.histories import read_trained
-from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
+from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import read_config
+from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.writing.convert import to_release
@@ -39,24 +40,26 @@ def test_recipes_match_the_settings_of_the_bundled_models():
         get_method(recipe.method)
         ModelOptions(**recipe.model)
         TrainOptions(**recipe.train)
-        for track, view in reference.TRACK_VIEWS.items():
-            HistoryOptions(TRACKS[track]["train"], **recipe.histories, **view)
-        config = read_config(MODELS / name / "layout")
+        PlayOptions(**recipe.play)
+        for view in reference.TRACK_VIEWS.values():
+            HistoryOptions(("demo_wide",), **recipe.histories, **view)
+        config = read_config(MODELS / name / recipe.tracks[-1])
         rate = {"learning_rate": reference.OWN_SHARE * recipe.train["learning_rate"]} if recipe.own_round else {}
         expected = {**recipe.model, **recipe.train, **rate, "method": recipe.method}
         given = {**config["model"], **config["train"], "method": config["method"]}
+        assert recipe.play.items() <= config.get("play", {}).items()
         assert {key: given[key] for key in expected} == {
             key: list(value) if isinstance(value, tuple) else value for key, value in expected.items()
         }
         assert bundled_models()[name].sampled is not recipe.greedy
         assert recipe.histories.items() <= config["histories"].items()
-    assert all(noise.end == (0.0, 0.0) and noise.finish[1] < 1 for noise in RL2_HISTORIES.values())
+    assert RL2_HISTORIES.end == (0.0, 0.0) and RL2_HISTORIES.finish[1] < 1
 
 
 def test_reference_command_rejects_unknown_names(tmp_path):
     with pytest.raises(
         OptionError,
-        match=r"rl2-reference does not learn from a teacher's histories.*ad-reference, dpt-reference, ad-rising",
+        match=r"rl2-reference does not learn from a teacher's histories.*ad-reference, dpt-reference",
     ):
         reference.check_learns_from_teacher("rl2-reference")
     command = ["research", "reference", "--name", "rl2-reference", "--out", str(tmp_path / "out"), "--teacher"]
@@ -68,18 +71,20 @@ def test_reference_command_rejects_unknown_names(tmp_path):
 def test_reference_model_is_bundled_with_all_tracks(tmp_path, monkeypatch):
     copied, cards = [], []
 
-    def fake_make(maker: ReferenceMaker, name: str, evaluates: bool) -> ReferenceOutcome:
-        return ReferenceOutcome(name, maker.track, tmp_path / maker.track, {})
+    def skip_training(job: ReferenceJob, on_update: OnUpdate) -> dict[str, Any]:
+        job.folder.mkdir()
+        return {}
 
-    monkeypatch.setattr(ReferenceMaker, "make", fake_make)
+    monkeypatch.setattr(ReferenceJob, "measure", skip_training)
+    monkeypatch.setattr(ReferenceJob, "evaluate", lambda job, show: None)
     monkeypatch.setattr(bundled, "bundle_run", lambda run, name, track, **way: copied.append((name, track)))
     monkeypatch.setattr(reference, "write_bundled_card", lambda name, found, **way: cards.append(found))
     command = ["research", "reference", "--name", "rl2-reference", "--out", tmp_path, "--bundle-as", "rl2-reference"]
     run_cli(*command, "--track", "layout", "--track", "teammate")
-    assert copied == [("rl2-reference", "layout"), ("rl2-reference", "teammate")]
-    assert [found.track for found in cards[0]] == ["teammate", "layout"]
+    assert copied == [("rl2-reference", "teammate"), ("rl2-reference", "layout")]
+    assert [job.track for job in cards[0]] == ["teammate", "layout"]
     printed = run_cli(*command, "--track", "layout", code=2)
-    assert "expected one --name, all tracks" in " ".join(printed.split())
+    assert "expected one --name, all tracks, one seed" in " ".join(printed.split())
 
 
 def test_card_of_a_reference_model_shows_command_and_training_curves(tmp_path, monkeypatch):
@@ -88,32 +93,40 @@ def test_card_of_a_reference_model_shows_command_and_training_curves(tmp_path, m
     trained = {"config": config, "manifest_sha256": "ab12", "run_hash": "1"}
 
     def invented_run(folder: Path) -> EvaluationRun:
-        run = evaluated_run("ad-reference", ("cramped_down",) if "layout" in folder.parts else ("demo_wide",))
+        run = evaluated_run(
+            "ad-reference", ("cramped_down",) if "ad-reference-layout-s3" in folder.parts else ("demo_wide",)
+        )
         return dataclasses.replace(run, sources=(run.sources[0]._replace(trained=trained, folder=str(folder)),))
 
     monkeypatch.setattr(reference, "read_run", invented_run)
     for track in TRACKS:
         (tmp_path / "ad-x" / track).mkdir(parents=True)
     (tmp_path / "ad-x" / "layout" / "curves.png").write_bytes(b"")
-    kinds = ("test-seeded", "validation", "diverse")
-    outcomes = [
-        ReferenceOutcome("ad-reference", track, tmp_path, {kind: Path(track) / kind for kind in kinds})
-        for track in TRACKS
-    ]
-    card = reference.write_bundled_card("ad-x", outcomes, tmp_path).read_text(encoding="utf-8")
-    assert "| made by | `icrl4aht-data research reference --name ad-reference --bundle-as ad-x` |" in card
+    jobs = [ReferenceJob("ad-reference", track, 3, tmp_path, "rl2-reference") for track in TRACKS]
+    card = reference.write_bundled_card("ad-x", jobs, tmp_path).read_text(encoding="utf-8")
+    assert (
+        "| made by | `icrl4aht-data research reference --name ad-reference --teacher rl2-reference --bundle-as ad-x` |"
+        in card
+    )
     shown = re.findall(r"!\[\w+\]\((.+)\)", card.split("## Curves")[1].split("## Limits")[0])
     assert shown == ["layout/curves.png"]
+
+
+def test_model_of_all_tracks_is_evaluated_on_all_tracks(tmp_path):
+    job = ReferenceJob("rl2-adapting", EVERY_TRACK, 0, tmp_path)
+    assert {task.track for task in job.evaluation_tasks("test")} == {*ALL_TRACKS}
+    assert {task.track for task in job.evaluation_tasks("diverse")} == {*TRACKS}
+    assert {task.track for task in ReferenceJob("x", "layout", 0, tmp_path).evaluation_tasks("test")} == {"layout"}
 
 
 @pytest.fixture
 def tiny_training_recipes(monkeypatch, tmp_path) -> Path:
     """Use tiny recipes, one layout, few tasks, and a part of the bundled release as training data."""
     for name, recipe in RECIPES.items():
-        sizes: dict[str, Any] = TINY if recipe.data else {"steps": 1, "batch_size": 8}
-        model = MODEL if recipe.data else MODEL | {"recurrent_layers": 1, "dropout": 0.0}
+        sizes: dict[str, Any] = {"steps": 1, "batch_size": 8} if recipe.plays else TINY
+        model = MODEL | {"recurrent_layers": 1, "dropout": 0.0} if recipe.plays else MODEL
         monkeypatch.setitem(RECIPES, name, dataclasses.replace(recipe, model=model, train=sizes))
-    monkeypatch.setitem(RL2_HISTORIES, "agent", NoiseConfig(2, 10, start=(0.5, 0.5)))
+    monkeypatch.setattr(reference, "RL2_HISTORIES", NoiseConfig(2, 10, start=(0.5, 0.5)))
     monkeypatch.setattr(reference, "OWN_HISTORIES", NoiseConfig(1, 10, start=(0.0, 0.0)))
     monkeypatch.setitem(reference.TRACK_PLAY, "layout", {"rearranged": 1})
     monkeypatch.setattr(reference, "TRACKS", {"layout": {"train": ("asymm_both",)}})
@@ -130,17 +143,23 @@ def tiny_training_recipes(monkeypatch, tmp_path) -> Path:
 
 @pytest.mark.slow
 def test_reference_model_trains_on_rl2_histories_then_on_its_own_histories(tiny_training_recipes):
-    maker = ReferenceMaker("layout", tiny_training_recipes, lambda *shown: None)
-    found = maker.make("ad-reference", evaluates=False)
-    assert found.run == tiny_training_recipes / "ad-reference-layout" and found.results == {}
-    made = {path.name for path in tiny_training_recipes.iterdir() if path.is_dir() and not path.name.startswith(".")}
-    own_round = {f"ad-reference-layout{end}" for end in ("", "-first", "-own", "-mixed")}
-    assert made == {"noise", "rl2-reference-layout", "agent-layout", *own_round}
-    trained = read_trained(found.run)
+    out = tiny_training_recipes
+    job = ReferenceJob("ad-reference", "layout", 0, out)
+    seen: list[int] = []
+    job.run(lambda step, speed: seen.append(step))
+    assert seen[-1] == job.updates == 4 and job.is_finished()
+    assert {path.name for path in out.iterdir() if path.is_dir() and not path.name.startswith(".")} == {
+        "noise",
+        "rl2-reference-layout-s0",
+        "agent-layout",
+        "ad-reference-layout-s0",
+    }
+    trained = read_trained(job.run_folder)
     assert trained.hide_recipe == ("asymm_both",) and trained.step == 2
     assert {cell["source"] for cell in trained.trained_on} == {"agent"}
-    own, mixed = (load_icrl4aht(tiny_training_recipes / f"ad-reference-layout-{name}") for name in ("own", "mixed"))
-    assert len(mixed) == len(own) + len(load_icrl4aht(tiny_training_recipes / "agent-layout"))
-    times = {path: path.stat().st_mtime_ns for path in tiny_training_recipes.rglob("*.safetensors")}
-    maker.make("ad-reference", evaluates=False)
-    assert {path: path.stat().st_mtime_ns for path in tiny_training_recipes.rglob("*.safetensors")} == times
+    own, mixed = (load_icrl4aht(job.folder / name) for name in ("own", "mixed"))
+    assert len(mixed) == len(own) + len(load_icrl4aht(out / "agent-layout"))
+    times = {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")}
+    job.result_file.unlink()
+    job.run()
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")} == times

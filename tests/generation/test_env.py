@@ -224,7 +224,7 @@ def test_recipe_changes_only_after_correct_deliveries(batch_steps):
         assert 0.4 < changed < 0.6 if correct else changed == 0
 
 
-def test_other_recipes_are_drawn_at_starts_and_after_deliveries():
+def test_four_recipes_are_drawn_uniformly_at_starts_and_after_deliveries():
     four = Compiled.jit(Environment(with_four_recipes(CRAMPED), max_steps=MAX_STEPS))
     np.testing.assert_array_equal(four.env.tables.recipes, FOUR_RECIPES)
     started = fields(CRAMPED, four.init(some_keys(4)).record).recipe

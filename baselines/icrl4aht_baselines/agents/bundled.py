@@ -1,4 +1,4 @@
-"""Models that are part of this package: `models/NAME/TRACK` is the run folder of model NAME for one track.
+"""Models that are part of this package: `models/NAME/TRACK` is the run folder of model NAME for one track, or for all.
 
 A bundled run folder holds the run's settings, its last parameters without the optimizer's state, and its training
 curves. The folder NAME also holds the model's card, and `bundle.json`, which states how the model plays by default.
@@ -18,10 +18,12 @@ from icrl4aht_generation.learners.resume import Checkpoints
 from icrl4aht_baselines.plotting import shrink_picture
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, CONFIG, RUN_CURVES, read_config
-from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.fetch import is_address
+from icrl4aht_data.format.layouts_file import LAYOUTS_NAME
 from icrl4aht_data.utils.files import parse_json, read_text, write_json
+from icrl4aht_data.utils.text import listed_names
 
 MODELS = Path(__file__).parents[1] / "models"
 """Folder of the bundled models."""
@@ -32,15 +34,18 @@ MODEL_CARD = "README.md"
 BUNDLE = "bundle.json"
 """Name of the JSON file with the last three fields of a `BundledModel`, in the folder `models/NAME`."""
 
+EVERY_TRACK = "all"
+"""Name, in place of a track, of a run that plays the tasks of all tracks."""
+
 _LARGEST = 2 * 10**6  # maximum size of a bundled model's parameters, in bytes
 
 
 class BundledModel(NamedTuple):
-    """A trained model that is part of this package, with one run folder for each of its tracks.
+    """A trained model that is part of this package.
 
     Attributes:
         name: name of the model, such as "ad-reference".
-        runs: track -> run folder of the model for this track.
+        runs: track, or `EVERY_TRACK`, -> run folder of the model for this track.
         sampled: whether the model samples its actions by default, instead of taking the most probable ones.
         role: purpose of the model, such as "best of AD".
         date: day on which the model was bundled, such as "2026-11-24".
@@ -52,15 +57,24 @@ class BundledModel(NamedTuple):
     role: str = ""
     date: str = ""
 
+    def track_on(self, layout: str) -> str:
+        """Return the key of the run in `runs` that plays a layout (short name)."""
+        return EVERY_TRACK if EVERY_TRACK in self.runs else track_of(layout)
+
 
 def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
     """Return the models in a folder of bundled models: name -> model."""
     found = {}
     for path in sorted(folder.glob("*/")):
-        runs = {track: path / track for track in TRACKS if (path / track / CONFIG).is_file()}
+        runs = {track: path / track for track in (*TRACKS, EVERY_TRACK) if (path / track / CONFIG).is_file()}
         if runs:
             found[path.name] = BundledModel(path.name, runs, **parse_json(read_text(path / BUNDLE)))
     return found
+
+
+def format_track(track: str) -> str:
+    """Return text with the name of a track, or "all tracks" for `EVERY_TRACK`."""
+    return "all tracks" if track == EVERY_TRACK else f"track {track}"
 
 
 def describe_model(model: BundledModel) -> list[str]:
@@ -72,8 +86,8 @@ def describe_model(model: BundledModel) -> list[str]:
         sources = sorted({cell["source"] for cell in trained.trained_on})
         context = "" if trained.method.data == "tasks" else f", K = {trained.context}"
         lines.append(
-            f"track {track}: {trained.label}, {count:,} parameters{context}, {trained.step:,} steps on "
-            f"{', '.join(trained.layouts)} (source {' and '.join(sources)})"
+            f"{format_track(track)}: {trained.label}, {count:,} parameters{context}, {trained.step:,} steps on "
+            f"{listed_names(trained.layouts)} (source {' and '.join(sources)})"
             + (", draws its actions" if model.sampled else "")
         )
     return lines
@@ -92,12 +106,12 @@ def check_bundle_name(name: str) -> None:
 def bundle_run(
     run: Path, name: str, track: str, folder: Path = MODELS, *, sampled: bool = False, role: str = ""
 ) -> Path:
-    """Copy a finished run to the bundled models, where it replaces the earlier run of its track. Return the new folder.
+    """Copy a finished run to the bundled models, where it replaces earlier runs of its track. Return the new folder.
 
     Args:
         run: folder of the run.
         name: name of the bundled model.
-        track: track of the tasks that the model plays.
+        track: track of the tasks that the model plays, or `EVERY_TRACK`.
         folder: folder of the bundled models.
         sampled: whether the model samples its actions by default, on all tracks.
         role: purpose of the model, such as "best of AD".
@@ -114,12 +128,15 @@ def bundle_run(
     if size > _LARGEST:
         raise OptionError(f"{run}: parameters of {size:,} bytes, expected at most {_LARGEST:,}: bundle a smaller model")
     target = folder / name / track
-    shutil.rmtree(target, ignore_errors=True)
+    for replaced in (track, *(TRACKS if track == EVERY_TRACK else (EVERY_TRACK,))):
+        shutil.rmtree(folder / name / replaced, ignore_errors=True)
     target.mkdir(parents=True)
     if not is_address(config["histories"]["root"]):  # a path on the training machine means nothing on other machines
         config["histories"]["root"] = Path(config["histories"]["root"]).name
     write_json(target / CONFIG, config, indent=1)
     Checkpoints(target / CHECKPOINTS).save({"params": trained.params}, trained.step)
+    if (run / LAYOUTS_NAME).is_file():
+        shutil.copyfile(run / LAYOUTS_NAME, target / LAYOUTS_NAME)
     if (run / RUN_CURVES).is_file():
         shrink_picture(run / RUN_CURVES, target / RUN_CURVES)
     about = {"sampled": sampled, "role": role, "date": f"{date.today()}"}

@@ -13,13 +13,12 @@ from icrl4aht_generation.experts.oracle import oracle
 from icrl4aht_generation.experts.search import searcher
 from icrl4aht_generation.policy import Policy
 
-from icrl4aht_baselines.agents.bundled import bundled_models
+from icrl4aht_baselines.agents.bundled import EVERY_TRACK, bundled_models
 from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.tokens import input_step
 from icrl4aht_baselines.methods.view_change import no_change
 from icrl4aht_baselines.training.histories import TrainedModel, read_trained
 from icrl4aht_baselines.training.run_folder import CONFIG
-from icrl4aht_data.benchmark.facts import track_of
 from icrl4aht_data.errors import OptionError, UnknownNameError, check_choice, unknown_name
 from icrl4aht_data.overcooked.actions import ACTIONS, STAY
 from icrl4aht_data.overcooked.channels import Channels
@@ -114,7 +113,7 @@ def agent_names() -> tuple[str, ...]:
 def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool | None = None) -> NamedEgo:
     """Return a reference ego, a bundled model, or the trained model in a run folder of `icrl4aht-data train`.
 
-    A bundled model has one set of parameters per track, and plays a layout with the parameters of the layout's track.
+    A bundled model plays a layout with its parameters for the layout's track, or for all tracks.
 
     Args:
         name: name of a reference ego or of a bundled model, or path of a run folder.
@@ -150,7 +149,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
     egos = {track: trained_ego(run, mode, str(model.runs[track])) for track, run in runs.items()}
 
     def make_ego(layout: Layout) -> Policy:
-        track = track_of(layout.name)
+        track = model.track_on(layout.name)
         if track not in egos:
             raise OptionError(
                 f"{name}: no model for layout {layout.name} of track {track}, only for tracks {' and '.join(egos)}: "
@@ -158,8 +157,10 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
             )
         return egos[track](layout)
 
-    details = {"model": name, "run": {track: run.hash for track, run in runs.items()}, **mode.details}
-    details["trained_on"] = {track: run.trained_on for track, run in runs.items()}
+    hashes = {track: run.hash for track, run in runs.items()}
+    trained_on = {track: run.trained_on for track, run in runs.items()}
+    details = {"model": name, "run": hashes.get(EVERY_TRACK, hashes), **mode.details}
+    details["trained_on"] = trained_on.get(EVERY_TRACK, trained_on)
     return NamedEgo(name + suffix, make_ego, details)
 
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import click
+from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_baselines.training.options import FILTERS, HistoryOptions
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options
+from icrl4aht_data.commands.dataclass_options import OptionValue, TopicCommand, dataclass_options, topic
 from icrl4aht_data.commands.options import COUNT, TRACK, Folder, Names, NewFile, examples, overwrite_option
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
@@ -111,10 +111,11 @@ def collect_command(
 
 @click.command(
     "reference",
+    cls=TopicCommand,
     epilog=examples(
         "icrl4aht-data research reference --name ad-reference",
         "icrl4aht-data research reference --name rl2-reference --track teammate --out runs/reference",
-        "icrl4aht-data research reference --name ad-rising --teacher rl2-reference",
+        "icrl4aht-data research reference --name ad-reference --teacher rl2-reference --seeds 3 --workers 2",
     ),
 )
 @click.option(
@@ -125,7 +126,14 @@ def collect_command(
     required=True,
     help="Model, such as ad-reference; repeat.",
 )
-@click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only models of this track.")
+@click.option(
+    "--track",
+    type=TRACK,
+    multiple=True,
+    default=tuple(TRACKS),
+    help="Only models of this track, and models of all tracks.",
+)
+@click.option("--seeds", type=COUNT, default=1, help="Training runs of each model, with different seeds.")
 @click.option(
     "--teacher",
     type=shared.EGO_NAME,
@@ -139,48 +147,71 @@ def collect_command(
     help="Also add the model to the package's bundled models under this name; see `models`.",
 )
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
+@topic("Machines", queue_options)
 def reference_command(
-    names: tuple[str, ...], track: tuple[str, ...], teacher: str | None, evaluates: bool, bundle: str | None, out: Path
+    names: tuple[str, ...],
+    track: tuple[str, ...],
+    seeds: int,
+    teacher: str | None,
+    evaluates: bool,
+    bundle: str | None,
+    out: Path,
+    queue: dict[str, Any],
 ) -> None:
     """Make reference models, and the data that they are trained on.
 
-    Generates a release of noise histories, trains one model for each track, and evaluates it. If a model learns from
+    Generates a release of scripted histories, trains a model for each track, and evaluates it. If a model learns from
     histories of a trained agent, they are recorded first. The same command resumes a stopped run. rl2-reference learns
-    by playing with training teammates. ad-reference and dpt-reference learn from histories of rl2-reference, labelled
-    with its choices. ad-rising imitates histories of rl2-reference that begin with random actions.
+    by playing with training teammates. rl2-adapting starts from it and plays tasks with a hidden dish; one model is
+    for all tracks. ad-reference and dpt-reference learn from histories of rl2-reference, labelled with its choices.
     """
-    from icrl4aht_baselines.agents.bundled import bundle_run, check_bundle_name
+    options = read_queue_options(queue)  # sets environment variables, which JAX reads at its first use
+    from icrl4aht_generation.jobs.queue import run_jobs
+    from icrl4aht_generation.learners.resume import limit_xla_threads
+    from rich.console import Console
+
+    from icrl4aht_baselines.agents.bundled import EVERY_TRACK, bundle_run, check_bundle_name
     from icrl4aht_baselines.agents.egos import find_agent
-    from icrl4aht_baselines.reference import RECIPES, ReferenceMaker, check_learns_from_teacher, write_bundled_card
+    from icrl4aht_baselines.reference import RECIPES, ReferenceJob, check_learns_from_teacher, write_bundled_card
 
     if bundle:
         try:
             check_bundle_name(bundle)
         except OptionError as error:
             raise click.UsageError(f"--bundle-as: {error}") from error
-        if len(names) != 1 or {*track} != set(TRACKS) or not evaluates:
+        if len(names) != 1 or {*track} != set(TRACKS) or not evaluates or seeds != 1:
             raise click.UsageError(
-                "--bundle-as: expected one --name, all tracks and an evaluation, because the card states its results; "
-                "leave out --track and --no-evaluate"
+                "--bundle-as: expected one --name, all tracks, one seed and an evaluation, because the card states its "
+                "results; leave out --track, --seeds and --no-evaluate"
             )
     if teacher:  # reports an invalid name now, not after hours of work
         find_agent(teacher)
         for name in names:
             check_learns_from_teacher(name)
-    outcomes = []
-    with progress_bars() as show:
-        for name, of_track in product(names, track):
-            outcomes.append(ReferenceMaker(of_track, out, show, teacher).make(name, evaluates))
-    for found in outcomes:
-        click.echo(f"{found.name}, {found.track}: {found.run}")
-        for kind, folder in found.results.items():
-            click.echo(f"  {kind}: {folder}")
+    jobs = [
+        ReferenceJob(name, of_track, seed, out, teacher)
+        for seed in range(seeds)
+        for name in dict.fromkeys(names)
+        for of_track in RECIPES[name].tracks
+        if of_track in (*track, EVERY_TRACK)
+    ]
+    if not jobs:
+        raise click.UsageError(f"--track {track[0]}: {' and '.join(names)} have no model of it; leave out --track")
+    taught = {job.track: None for job in jobs if not (job.recipe.plays or teacher)}
+    teachers = [ReferenceJob("rl2-reference", of_track, 0, out) for of_track in taught]
+    limit_xla_threads(1)  # equal to the workers' limit, so that workers can resume these jobs
+    run_jobs([*dict.fromkeys([*teachers, *jobs])], out, Console(soft_wrap=True), options)
+    if evaluates:
+        with progress_bars() as show:
+            for job in jobs:
+                job.evaluate(show)
+    for job in jobs:
+        click.echo(f"{job.label}: {job.folder}")
     if bundle:
-        for found in outcomes:
-            sampled, role = not RECIPES[found.name].greedy, RECIPES[found.name].role
-            click.echo(f"bundled: {bundle_run(found.run, bundle, found.track, sampled=sampled, role=role)}")
-        in_order = sorted(outcomes, key=lambda found: list(TRACKS).index(found.track))
-        click.echo(f"card: {write_bundled_card(bundle, in_order, teacher=teacher)}")
+        for job in jobs:
+            sampled, role = not job.recipe.greedy, job.recipe.role
+            click.echo(f"bundled: {bundle_run(job.run_folder, bundle, job.track, sampled=sampled, role=role)}")
+        click.echo(f"card: {write_bundled_card(bundle, jobs)}")
 
 
 def _print_schema(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:

@@ -31,7 +31,7 @@ from icrl4aht_data.commands.options import (
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.text import counted_noun
+from icrl4aht_data.utils.text import counted_noun, listed_names
 
 
 def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
@@ -193,7 +193,7 @@ def prepare_training(
         text = (
             f"{method}: layers {sized.recurrent_layers}, width {sized.width}, encoder {sized.encoder}, steps "
             f"{options.steps}, in each {len(job.trainer.tasks)} tasks of {episodes}\nplaying on "
-            f"{', '.join(played['layouts'])}, canonical channels, with the teammates of {len(played['groups'])} "
+            f"{listed_names(played['layouts'])}, canonical channels, with the teammates of {len(played['groups'])} "
             f"families and layouts"
         )
         return job, text

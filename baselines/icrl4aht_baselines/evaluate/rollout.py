@@ -158,7 +158,7 @@ class EvaluationRollout:
 
 @lru_cache(maxsize=64)
 def _protocol_layout(layout: Layout, protocol: Protocol) -> Layout:
-    """Return a layout with the recipes of the protocol, unless the task fixes the recipes."""
+    """Return a layout with four recipes if the protocol requires them; other recipes than the published ones stay."""
     published = LAYOUTS.get(layout.name)
     four = protocol.four_recipes and any(layout.name in names for names in TRACKS["layout"].values())
     if not four or published is None or layout.recipes != published.recipes:
@@ -167,7 +167,7 @@ def _protocol_layout(layout: Layout, protocol: Protocol) -> Layout:
 
 
 def no_outcome(batch: int) -> EgoInput:
-    """Return the input of B egos before the first step of a task: an outcome of zeros, without observations."""
+    """Return the input of B egos at the first step of a task: all `prev_*` fields are 0, and `obs` is empty."""
     zero = jnp.zeros(batch, jnp.int32)
     return EgoInput(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
 

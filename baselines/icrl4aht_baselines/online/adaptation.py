@@ -64,7 +64,7 @@ class HeadroomJob(EgoJob):
 
     @property
     def label(self) -> str:
-        """Name of the job that progress displays show: set of tasks, kind of ego and seed."""
+        """Name of the job for progress displays: set of tasks, kind of ego and seed."""
         return f"{self.title}, {self.kind}, seed {self.seed}"
 
     @property

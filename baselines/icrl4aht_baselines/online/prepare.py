@@ -85,7 +85,8 @@ def prepare_play(
         for group in groups
         for task in group
     ]
-    labels: Labels | None = "oracle" if play.imitation else None  # the searcher also acts as the oracle does
+    # The searcher counts as the oracle, because it is an oracle with a belief about the recipe.
+    labels: Labels | None = "oracle" if play.imitation else None
     about = {
         "model": asdict(model),
         "play": asdict(play),
@@ -201,7 +202,7 @@ def _task_groups(
 
 
 def _fixes_dish(layout: Layout) -> bool:
-    """Return whether the tasks on a layout want one of its dishes in all episodes."""
+    """Return whether the recipes of a layout are replaced by one dish, the only rewarded dish in all episodes."""
     return len(layout.recipes) == 1 and layout.recipes != get_layout(layout.name).recipes
 
 
@@ -272,9 +273,9 @@ def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
 def _training_record(
     dataset: Dataset | None, tasks: Sequence[Task], played: set[str], labels: Labels | None
 ) -> list[dict[str, Any]]:
-    """Return the record of training data for the tasks that are played, see `training_cells`.
+    """Return the record of training data for the tasks that are played; see `training_cells`.
 
-    Tasks without histories get separate entries, with the source `TASKS_SOURCE`.
+    Tasks without histories get separate entries, whose source is `TASKS_SOURCE`.
     """
     found = []
     if dataset is not None:

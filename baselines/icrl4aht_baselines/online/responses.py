@@ -41,7 +41,7 @@ from icrl4aht_data.benchmark.best_responses import (
     read_best_responses,
     write_best_responses,
 )
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, LAYOUT_NAMES, LEAST_HEADROOM, TESTED_ON, track_of
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LAYOUT_NAMES, LEAST_HEADROOM, TESTED_ON
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import unknown_name
@@ -152,7 +152,7 @@ class EgoJob(TrainingJob):
         """Train an ego on tasks, or resume a stopped run. Return the trainer and the parameters.
 
         Args:
-            played: tasks to play in every step; with `partner`, the ego observes the teammate's number.
+            played: tasks that every training step plays; if their `partner` is set, the ego observes this number.
             on_update: function for progress, see `run`.
             params: initial parameters; by default random ones that depend on the seed.
         """
@@ -209,7 +209,8 @@ class ResponseJob(EgoJob):
             models = bundled_models()
             if self.options.init not in models:
                 raise unknown_name("bundled model", self.options.init, models)
-            params = read_trained(models[self.options.init].runs[track_of(task.layout.name)]).params
+            model = models[self.options.init]
+            params = read_trained(model.runs[model.track_on(task.layout.name)]).params
         mate = build_teammate(task.layout, task.teammate)
         played = PlayTask(task.layout, task.teammate_kind, mate, False, task.layout.name)
         trainer, params = self.train([played] * self.options.tasks, on_update, params)
@@ -315,9 +316,10 @@ def write_responses(
 
 
 def responses_table(folder: Path) -> str:
-    """Return a Markdown table of a folder's best responses: B, range of the runs' returns, and rise of the best run.
+    """Return a Markdown table of a folder's best responses.
 
-    "rise" is the best run's `slope`; a rise of several points shows that training was too short.
+    Column "B" is the best return. Column "rise" is the `slope` of the best training run: if the returns still rose by
+    several points, the training was too short.
     """
     body = []
     for one in read_best_responses(folder / RESPONSES_FILE).behaviours:

@@ -260,7 +260,7 @@ class _Player:
         env, change = self.rollout.env, state.ego.change
         record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))
         taken, theirs = actions[..., EGO], actions[..., TEAMMATE]
-        # One step follows the played ones. Its value bootstraps the last step's return.
+        # The inputs include the step after the played ones, whose value bootstraps the return.
         look = partial(observe, agent=EGO, canonical=True)
         seen_records = jnp.concatenate([played.record, after.env.record[:, None]], axis=1)
         steps = StepInput(

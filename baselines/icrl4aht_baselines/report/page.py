@@ -226,7 +226,7 @@ def describe_conditions(runs: Iterable[EvaluationRun], cells: Container[ResultCe
 
 
 def instances_range(numbers: Iterable[int]) -> str:
-    """Return the range of some numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
+    """Return a range of numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
     found = sorted(set(numbers))
     return counted_noun(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
 

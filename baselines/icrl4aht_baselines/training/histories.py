@@ -26,6 +26,7 @@ from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_data.dataset import Dataset, load_icrl4aht, teammate_ids, teammate_names
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.fetch import Remote
+from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, read_layouts_file
 from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -357,6 +358,7 @@ def read_trained(folder: Path) -> TrainedModel:
         # An option that this version does not have is an error only if the run used it.
         stated = {k: v for k, v in config["model"].items() if v or hasattr(ModelOptions(), k)}
         model = ModelOptions(**stated)
+        read_layouts_file(folder / LAYOUTS_NAME)
         layouts = [get_layout(name) for name in histories["layouts"]]
         channels, obs_shape = histories["channels"], tuple(histories["obs_shape"])
         expected = observation_shape(layouts[0], channels == "canonical")

@@ -20,7 +20,7 @@ class TrainingJob(ABC):
     Attributes:
         seed: seed of the training run.
         options: settings with the attributes `training`, a function from the seed to the settings of the trainer, and
-            `steps_per_update`, the number of environment or history steps of a training step.
+            `steps_per_update`; not needed if a class overrides the properties of these names.
         out: folder of all jobs.
         xla_threads, is_quick: see `Job`.
     """
@@ -66,6 +66,11 @@ class TrainingJob(ABC):
         return self.options.training(self.seed)
 
     @property
+    def steps_per_update(self) -> int:
+        """Number of environment or history steps of a training step."""
+        return self.options.steps_per_update
+
+    @property
     def updates(self) -> int:
         """Number of training steps."""
         return self.training.steps
@@ -80,12 +85,23 @@ class TrainingJob(ABC):
 
     def progress(self) -> tuple[int, float] | None:
         """Return the finished training steps, and environment or history steps/s; None if no line is logged."""
-        timing = last_line(self.run_folder / TIMING)
-        return None if timing is None else (timing["step"], timing["steps_per_second"] * self.options.steps_per_update)
+        for run, before in self.runs():
+            if timing := last_line(run / TIMING):
+                return before + timing["step"], timing["steps_per_second"] * self.steps_per_update
+        return None
 
-    def step_progress(self, on_update: OnUpdate) -> StepProgress:
-        """Return a function for the trainer to report progress with, which calls `on_update`."""
-        return lambda step, loss: on_update(step, (self.progress() or (0, 0.0))[1])
+    def runs(self) -> list[tuple[Path, int]]:
+        """Return the folders of the training runs, last one first, with the number of earlier training steps."""
+        return [(self.run_folder, 0)]
+
+    def step_progress(self, on_update: OnUpdate, before: int = 0) -> StepProgress:
+        """Return a function for the trainer to report progress with, which calls `on_update`.
+
+        Args:
+            on_update: see `Job.run`.
+            before: number of training steps of earlier training runs of the job.
+        """
+        return lambda step, loss: on_update(before + step, (self.progress() or (0, 0.0))[1])
 
     def finished_text(self) -> str:
         """Return a note on the result for progress displays."""

@@ -1,4 +1,4 @@
-"""Run folders, which hold config.json, metrics.jsonl, timing.jsonl, curves.png, checkpoints/ and logger folders.
+"""Run folders, which hold config.json, layouts.jsonl, metrics.jsonl, timing.jsonl, curves.png, checkpoints/ and logs.
 
 Checkpoints, logs and resuming are in `icrl4aht_generation.learners.resume`; this module reads and writes settings.
 """
@@ -14,6 +14,8 @@ from icrl4aht_generation.learners.resume import METRICS, TIMING, Checkpoints, di
 
 from icrl4aht_baselines.training.loggers import LOGGER_NAMES
 from icrl4aht_data.errors import IndexFormatError, OptionError
+from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, write_layouts_file
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, check_folder_content, parse_json, read_text, write_json
 
 RUN_FORMAT = 4
@@ -21,7 +23,7 @@ RUN_FORMAT = 4
 config.json, and version 4 adds `channels`."""
 
 CONFIG, RUN_CURVES, CHECKPOINTS = "config.json", "curves.png", "checkpoints"
-_FILES = {CONFIG, RUN_CURVES, CHECKPOINTS, METRICS, TIMING, *LOGGER_NAMES}
+_FILES = {CONFIG, RUN_CURVES, CHECKPOINTS, LAYOUTS_NAME, METRICS, TIMING, *LOGGER_NAMES}
 
 
 def format_versions() -> dict[str, Any]:
@@ -86,6 +88,8 @@ def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
     check_folder_content(folder, _FILES, "a run")
     folder.mkdir(parents=True, exist_ok=True)
     if jax.process_index() == 0:
+        names = config.get("histories", {}).get("layouts", ())
+        write_layouts_file(folder / LAYOUTS_NAME, map(get_layout, names))  # to evaluate the run without its release
         with atomic_write(folder / CONFIG) as partial:
             write_json(partial, config)
     return config

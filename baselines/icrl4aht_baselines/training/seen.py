@@ -10,6 +10,7 @@ from msgspec import Struct, ValidationError, convert
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS, all_families
 from icrl4aht_data.benchmark.tasks import Task, teammate_id
 from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.format.layouts_file import is_generated
 from icrl4aht_data.overcooked.layouts import get_layout
 
 TRAINED_ON = "trained_on"
@@ -68,8 +69,8 @@ def read_trained_on(entries: Any, where: str) -> SeenInTraining:
         kinds = kinds or [name for name in TEAMMATE_PLUGINS.names if name == entry.family]
         if not kinds or entry.algorithm not in (None, *kinds):
             raise OptionError(f"{expected}; found {entry}")
-        try:
-            layouts.append(get_layout(entry.layout).name)
+        try:  # a generated layout may be one that this process does not know, and that no test task has
+            layouts.append(entry.layout if is_generated(entry.layout) else get_layout(entry.layout).name)
         except UnknownNameError as error:
             raise OptionError(f"{where}: {TRAINED_ON}: {error}") from error
         for kind in [entry.algorithm] if entry.algorithm else kinds:

@@ -47,7 +47,7 @@ def format_loss(loss: float | None) -> str:
 
 
 def show_steps(show: Callable[..., None], name: str, steps: int) -> StepProgress:
-    """Return a `StepProgress` that shows a progress bar for `steps` steps by `show` of `progress_bars`."""
+    """Return a `StepProgress` that updates a progress bar with `show`, the function that `progress_bars` yields."""
     return lambda step, loss: show(name, step, steps, format_loss(loss))
 
 

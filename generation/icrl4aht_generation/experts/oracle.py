@@ -63,8 +63,8 @@ def oracle(layout: Layout | Sequence[Layout]) -> Policy:
     """Return the oracle, a scripted ego.
 
     Args:
-        layout: one layout, for a policy that sees its state records; or several layouts, for a policy that sees a
-            `Situation` on one of them.
+        layout: one layout or several layouts. With one layout, the policy sees state records; with several, it sees a
+            `Situation`, which has the number of the layout.
     """
     if isinstance(layout, Layout):
         return on_layout(SITUATION_ORACLE._replace(params=oracle_params([layout])), layout)
@@ -219,7 +219,7 @@ class OracleView:
 
     @cached_property
     def spoiled_pots(self) -> Bool[Array, " P"]:
-        """Pots with contents that fit no recipe, which the ego fills up and clears if no other pot is left."""
+        """Partly filled pots whose contents fit no recipe; if no pot is left, the ego fills up and empties one."""
         nowhere = self.facts.pots & ~self.full & (self.contents > 0) & (jnp.min(self.plan_costs, axis=1) == NEVER)
         return nowhere & (self.stock[0] == 0) & self.facts.serves
 

@@ -3,8 +3,8 @@
 The searcher plays like the oracle, but cooks a believed recipe instead of the current recipe. It remembers over the
 episodes of a task which dishes earned no reward (refused) and which dish was rewarded (paid). Before any reward, the
 searcher believes in the dish that best fits the ingredients that the teammate has put into pots, and breaks ties at
-random. The belief changes only while nothing is being cooked. This ego is for tasks that want one dish in all episodes,
-see `Task.recipes`.
+random. The belief changes only while nothing is being cooked. This ego is for tasks that reward only one dish in all
+episodes, see `Task.recipes`.
 
 The searcher can also advise another ego that acts in its place, so that this ego learns to search. Its belief then also
 follows the dish that the ego has begun, because an unrefused dish is as good a try as the searcher's own.
@@ -80,7 +80,7 @@ def padded_dishes(layouts: Sequence[Layout]) -> np.ndarray:
 
 
 def with_taken_action(memory: OracleMemory | SearchMemory, action: Int[Array, "*B"]) -> Any:
-    """Return a memory of the oracle or the searcher in which the taken action replaces the chosen action."""
+    """Return the memory of a scripted ego after a step in which the executed action was not its own choice."""
     if isinstance(memory, SearchMemory):
         return memory._replace(oracle=memory.oracle._replace(action=action))
     return memory._replace(action=action)

@@ -103,7 +103,7 @@ class CompactView:
 
     @property
     def entries(self) -> np.ndarray:
-        """Indices of the flat observation's entries that `WindowEntries` contain, int64 (E,)."""
+        """Indices of the entries of a flat observation that are not always 0, int64 (E,); see `WindowEntries`."""
         return self.words.entries(self.agents)
 
     def __call__(self, record: UInt8[Array, "*B S"], layout_number: Array | None = None) -> Seen:

@@ -18,7 +18,7 @@ from icrl4aht_generation.learners.resume import TIMING
 from icrl4aht_generation.populations.train import POPULATION
 
 _IGNORED = {TIMING, FAILED, LABELLER_RETURNS}
-"""Names of files that are not compared: speeds, failures, and measurements that packing adds to artefacts."""
+"""Names of files that are not compared, because they have times, tracebacks, or measurements of packed artefacts."""
 
 _TEXT = {".json", ".jsonl", ".md", ".sha256"}
 
@@ -42,7 +42,7 @@ class Comparison:
 def compare_rebuilds(a: Path, b: Path) -> Comparison:
     """Compare two folders by the hashes of their files.
 
-    Speeds, failures, hidden files, and files that packing adds to artefacts are not compared.
+    Hidden files, timing.jsonl, failed.jsonl and labeller_returns.json are not compared.
 
     Raises:
         OptionError: if a path is not a folder, or neither folder has files to compare.

@@ -286,7 +286,7 @@ def _script_labels(source: str, references: ReferenceEgos) -> ExpertLabels:
 
 
 def _label_function(found: TaskHistories, labeller: Path | None) -> Callable[[int, np.ndarray], np.ndarray]:
-    """Return a function of a stream's number and states, uint8 (T, S), that returns expert actions, int8 (T,)."""
+    """Return a function from a stream's number and states, uint8 (T, S), to its expert actions, int8 (T,)."""
     if labeller is None:
         script = np.load(found.folders[0] / "script_actions.npy", mmap_mode="r")
         return lambda stream, states: script[stream]

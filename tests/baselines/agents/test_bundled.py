@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 from icrl4aht_baselines.agents import bundled
-from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
+from icrl4aht_baselines.agents.bundled import EVERY_TRACK, MODEL_CARD, MODELS, bundle_run, bundled_models
 from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.report.comparison import describe_scores, read_stored, results_file
@@ -76,6 +76,17 @@ def test_model_bundled_as_sampled_samples_its_actions_by_default(trained_run, tm
         find_agent(trained_run, acting="exat")  # type: ignore[arg-type]
 
 
+def test_model_of_all_tracks_plays_every_layout_and_replaces_models_of_one_track(trained_run, models):
+    folder = bundle_run(trained_run, "ad-tiny", EVERY_TRACK, models)
+    assert [path.name for path in (models / "ad-tiny").iterdir() if path.is_dir()] == [EVERY_TRACK]
+    agent, trained = find_agent("ad-tiny"), read_trained(folder)
+    assert agent.details and (agent.details["run"], agent.details["trained_on"]) == (trained.hash, trained.trained_on)
+    assert {agent.make(get_layout(name)).sees for name in ("demo_wide", "cramped_down")} == {"canonical_input"}
+    assert "all tracks: AD+mlp" in run_cli("models")
+    bundle_run(trained_run, "ad-tiny", "layout", models)
+    assert [*bundled_models(models)["ad-tiny"].runs] == ["layout"]
+
+
 def test_bundling_rejects_invalid_names_unfinished_runs_and_large_models(trained_run, tmp_path, monkeypatch):
     for name in ("../ad", "oracle", "AD-x", ""):
         with pytest.raises(OptionError, match="expected lowercase words joined by hyphens, such as ad-reference"):
@@ -103,7 +114,8 @@ def test_models_in_the_package_are_small_and_loadable_and_have_cards():
         for track, folder in model.runs.items():
             size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
             assert size < 2.1e6, folder
-            for layout in {"teammate": ("demo_wide", "coord_ring"), "layout": ("asymm_right", "cramped_down")}[track]:
+            played = {"teammate": ("demo_wide", "coord_ring"), "layout": ("asymm_right", "cramped_down")}
+            for layout in played.get(track, ("demo_wide", "asymm_right", "templates-0-217")):
                 assert agent.make(get_layout(layout)).sees == "canonical_input"
 
 

@@ -19,7 +19,10 @@ from icrl4aht_baselines.training.run_folder import CHECKPOINTS, format_versions,
 from icrl4aht_generation.learners.resume import Checkpoints
 from icrl4aht_generation.teammates.instances import published_tasks
 
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.format.layouts_file import layout_family
+from icrl4aht_data.overcooked import layouts
 from tests.helpers.commands import run_cli
 from tests.helpers.small_models import random_parameters
 
@@ -34,11 +37,16 @@ def runs(lite, tmp_path_factory) -> Path:
     """Return a folder with run folders `ad` and `dpt` of two models with random parameters."""
     folder = tmp_path_factory.mktemp("runs")
     for name in ("ad", "dpt"):
-        job = prepare(name, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(lite[0])))
-        config = {**format_versions(), "method": name, **job.about, "train": dataclasses.asdict(OPTIONS)}
-        open_run(folder / name, config)
-        Checkpoints(folder / name / CHECKPOINTS).save({"params": random_parameters(job.method), "step": np.int32(2)}, 2)
+        write_run(folder / name, HistoryOptions(("demo_wide",), str(lite[0])))
     return folder
+
+
+def write_run(folder: Path, histories: HistoryOptions) -> None:
+    """Write a run folder of a model with random parameters; the folder has the name of the method."""
+    job = prepare(folder.name, MODEL, OPTIONS, histories)
+    config = {**format_versions(), "method": folder.name, **job.about, "train": dataclasses.asdict(OPTIONS)}
+    open_run(folder, config)
+    Checkpoints(folder / CHECKPOINTS).save({"params": random_parameters(job.method), "step": np.int32(2)}, 2)
 
 
 def test_evaluation_of_a_trained_model_stores_settings_of_its_run(runs, tmp_path):
@@ -52,6 +60,16 @@ def test_evaluation_of_a_trained_model_stores_settings_of_its_run(runs, tmp_path
     assert result.settings["details"] == settings
     with pytest.raises(OptionError, match=r"of other settings \(details.acting: it has .*; details.step: it has 2"):
         evaluate(agent.name, agent.make, WIDE[:1], SHORT, details={"step": 3}, out=tmp_path)
+
+
+def test_run_on_generated_layouts_is_evaluated_without_its_release(tmp_path, monkeypatch):
+    name = next(one.name for one in load_icrl4aht(source="noise").layouts if layout_family(one.name) == "templates")
+    write_run(tmp_path / "ad", HistoryOptions((name,)))
+    monkeypatch.setattr(layouts, "_RELEASE_LAYOUTS", {})  # as in a process that has not opened the release
+    with pytest.raises(UnknownNameError):
+        layouts.get_layout(name)
+    agent = find_agent(tmp_path / "ad")
+    assert agent.make(layouts.get_layout(name)).sees == "ego_input"
 
 
 class TestInvalidRuns:

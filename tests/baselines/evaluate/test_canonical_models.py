@@ -17,7 +17,7 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, RolloutState
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.reference import ReferenceOutcome, write_bundled_card
+from icrl4aht_baselines.reference import ReferenceJob, write_bundled_card
 from icrl4aht_baselines.report.results import note_results
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
@@ -62,18 +62,16 @@ def test_training_on_all_layouts_uses_canonical_channels(trained_run):
     assert (run.channels, run.obs_shape, run.layouts) == ("canonical", (5, 5, 46), ("coord_simple", "demo_wide"))
 
 
-def test_model_is_evaluated_on_a_layout_without_training_data(trained_run, tmp_path):
+def test_model_is_evaluated_on_a_layout_without_training_data(trained_run, tmp_path, monkeypatch):
     folder, _ = trained_run
     agent = find_agent(str(folder))
     task = published_task(THIRD.name, "H4/t0")
     results = evaluate(agent.name, agent.make, [task], SHORT, details=agent.details, out=tmp_path)
     assert np.shape(results[0].returns) == (1, 1)
     note_results(tmp_path, folder)
-    outcome = ReferenceOutcome(
-        "x-y", "layout", folder, dict.fromkeys(("test-seeded", "validation", "diverse"), tmp_path)
-    )
+    monkeypatch.setattr(ReferenceJob, "results", lambda job, kind: tmp_path)
     (tmp_path / "x-y").mkdir()
-    card = write_bundled_card("x-y", [outcome], tmp_path).read_text(encoding="utf-8")
+    card = write_bundled_card("x-y", [ReferenceJob("x-y", "layout", 0, folder)], tmp_path).read_text(encoding="utf-8")
     assert "| cramped_down | `" in card and ", manifest with SHA-256 `" in card
 
 

@@ -57,7 +57,7 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
     ("change", "message"),
     [
         (lambda c, one, task: c.update(agent="search"), "search names a reference ego or a bundled model; give"),
-        (lambda c, one, task: c.update(agent="ad-rising"), "ad-rising names a reference ego or a bundled"),
+        (lambda c, one, task: c.update(agent="dpt-reference"), "dpt-reference names a reference ego or a bundled"),
         (lambda c, one, task: c.update(agent="rule (greedy)"), "without a play mode at the end"),
         (lambda c, one, task: c.update(agent="a | b"), "not a file of results: .*matching regex"),
         (lambda c, one, task: c.update(best_responses="99"), r"best responses '99', but this package has '0'"),

@@ -1,4 +1,4 @@
-"""Test tasks as Gymnasium environments: Gymnasium's checker, registered ids, and replays of histories."""
+"""Test the Gymnasium environment of a task: Gymnasium's checker, registered ids, and replays of histories."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test recording of roll-outs, selection of the streams of a release, and labels of recorded steps."""
+"""Test recording of rollouts, selection of the streams of a release, and labels of recorded steps."""
 
 from __future__ import annotations
 

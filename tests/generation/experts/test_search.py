@@ -1,4 +1,4 @@
-"""Test the belief of the searcher that advises another ego."""
+"""Test which dish the scripted searcher believes to be wanted, when it acts itself and when it advises another ego."""
 
 from __future__ import annotations
 

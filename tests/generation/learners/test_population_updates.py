@@ -37,12 +37,12 @@ class UpdateResult(NamedTuple):
 
     Attributes:
         population: the updated population.
-        update: compiled function from a state to the next state, the metrics, and the carry and steps of the roll-out.
+        update: compiled function from a state to the next state, the metrics, and the carry and steps of the rollout.
         before: state before the update.
         after: state after the update.
         metrics: metrics of the update.
-        carry: environments and memories after the update's roll-out.
-        rollout: steps of the update's roll-out.
+        carry: environments and memories after the update's rollout.
+        rollout: steps of the update's rollout.
     """
 
     population: Population
@@ -172,7 +172,7 @@ def test_lbrdiv_multipliers_follow_the_returns_of_the_environments(lbrdiv):
 
 
 def test_comedi_starts_some_episodes_in_states_of_mixed_play(comedi):
-    """The last quarter of environments starts from states that the third quarter visited in the previous roll-out."""
+    """The last quarter of environments starts from states that the third quarter visited in the previous rollout."""
     source = comedi.population.assignment.starts_from
     started = np.asarray(comedi.after.carry.env.record)
     visited = np.asarray(comedi.before.visited)

@@ -118,9 +118,9 @@ def test_critics_receive_the_partner_if_partners_vary():
 
 
 def weights_by_paper(algorithm: Any, memory: Any) -> np.ndarray:
-    """Return float64 (2, N), the weight of each slot's return in the policy's objective by the paper's equations.
+    """Return the weight of each slot's return in the objective of the slot's policy, float64 (2, N).
 
-    An expected return in the equations is the mean over the slots of a pair of policies.
+    The objectives are the paper's equations. The expected return of a pair of policies is the mean over its slots.
     """
     assignment = algorithm.assignment(16)
     k = getattr(algorithm, "members", 0)

@@ -2,7 +2,7 @@
 
 All tests use one tiny learner. Its ego stands between two buttons, a pile and a pot, so it often presses a button
 (reward -5) or fills the pot (shaped reward 3). Roll-outs have 8 steps and episodes have 12, so
-one episode ends inside the second roll-out, and one at the end of the third.
+one episode ends inside the second rollout, and one at the end of the third.
 """
 
 from __future__ import annotations
@@ -126,12 +126,12 @@ def trained(update, initial_state) -> UpdateSequence:
 
 
 def ego_choices(rollout: Rollout) -> Choice:
-    """Return the ego's actions, log-probabilities and values in a roll-out."""
+    """Return the ego's actions, log-probabilities and values in a rollout."""
     return rollout.choices[EGO]
 
 
 def ego_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
-    """Return the training sequences of the ego in the roll-out that starts in the given state."""
+    """Return the training sequences of the ego in the rollout that starts in the given state."""
     slots, hidden = np.arange(CONFIG.environments), state.carry.memories[EGO]
     view = CompactView("paper", (CLOSET,))
     return sequences(view, rollout, EGO, slots, hidden, jnp.zeros(slots.size), jnp.float32(0))
@@ -174,7 +174,7 @@ def replay(learner: Learner, state: LearnerState, rollout: Rollout, reset: np.nd
 
 
 def test_training_sequences_replay_a_roll_out_across_episodes(learner, played):
-    """The second roll-out starts inside an episode with a nonzero hidden state; the next episode starts at step 4."""
+    """The second rollout starts inside an episode with a nonzero hidden state; the next episode starts at step 4."""
     state, rollout = played.before[1], played.rollouts[1]
     np.testing.assert_array_equal(rollout.reset.nonzero()[0], [4] * 4)
     np.testing.assert_array_equal(rollout.done.nonzero()[0], [3] * 4)
@@ -276,7 +276,7 @@ delivery with 0 and 1 press."""
 
 
 def rewarded_rollout() -> Rollout:
-    """Return a roll-out of two environments with `REWARDS`; agent a has the shaped reward a + 1 in every step."""
+    """Return a rollout of two environments with `REWARDS`; agent a has the shaped reward a + 1 in every step."""
     size = (len(REWARDS), 2)
     zeros, choices = jnp.zeros(size), jnp.zeros((len(REWARDS), 4))
     return Rollout(

@@ -1,4 +1,4 @@
-"""Test roll-outs: agent slots, observations, memories that restart with each episode, and a restart hook.
+"""Test rollouts: agent slots, observations, memories that restart with each episode, and a restart hook.
 
 Four environments have episodes of five steps. Two scripted players share the eight slots in mixed order; each
 remembers the state record at the start of the episode and the number of steps since.
@@ -64,7 +64,7 @@ def scripted_player(slots: np.ndarray) -> Player:
 
 
 def expected_actions(record: np.ndarray) -> np.ndarray:
-    """Return the actions int (T, N, 2) of the scripted players in a roll-out that starts with new episodes."""
+    """Return the actions int (T, N, 2) of the scripted players in a rollout that starts with new episodes."""
     slot = np.arange(2 * ENVS).reshape(2, ENVS).T
     step = np.arange(len(record))
     begun = record[step - step % EPISODE].sum(axis=-1, dtype=np.int64)
@@ -80,7 +80,7 @@ def swap_positions(state: EnvState, done: jax.Array) -> EnvState:
 class JoinedRollouts(NamedTuple):
     start: RolloutCarry
     carry: RolloutCarry  # state after the last step
-    rollout: Rollout  # steps of both roll-outs
+    rollout: Rollout  # steps of both rollouts
 
 
 PLAYERS = [scripted_player(slots) for slots in SLOTS]
@@ -88,7 +88,7 @@ scripted_rollout = jax.jit(lambda carry, key: roll_out(ENV, PLAYERS, carry, STEP
 
 
 def play(run: Any) -> JoinedRollouts:
-    """Return two successive roll-outs joined into one, as NumPy arrays."""
+    """Return two successive rollouts joined into one, as NumPy arrays."""
     start = init_rollout(ENV, PLAYERS, jax.random.split(jax.random.key(0), ENVS))
     middle, one = run(start, jax.random.key(1))
     carry, other = run(middle, jax.random.key(2))
@@ -142,7 +142,7 @@ def test_actions_of_players_reach_their_agent_slots(played):
 
 
 def test_roll_out_equals_single_steps_of_the_environment(played):
-    """Compare a roll-out with a loop over steps of the environment."""
+    """Compare a rollout with a loop over steps of the environment."""
     step = jax.jit(ENV.step)
     state = played.start.env
     for t, actions in enumerate(played.rollout.actions):
@@ -182,7 +182,7 @@ def test_players_restart_only_in_environments_whose_episode_ended():
         np.testing.assert_array_equal(notes.steps, (clock[slots % ENVS] + STEPS) % EPISODE)
 
 
-def test_returns_add_up_rewards_of_an_episode_across_roll_outs(played):
+def test_returns_add_up_rewards_of_an_episode_across_rollouts(played):
     """The environment's rewards are replaced by synthetic ones, since scripted play earns few rewards."""
 
     class SyntheticRewards(Environment):

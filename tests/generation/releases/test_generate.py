@@ -150,7 +150,7 @@ def quick_measurements():
 
 @pytest.fixture(scope="module")
 def learned_rebuild(tmp_path_factory) -> Path:
-    """Return a rebuild with learned teammates, selected without a threshold for returns (read-only)."""
+    """Return generated releases with learned teammates, selected without a minimum return (read-only)."""
     profile = tmp_path_factory.mktemp("learned") / "learned.toml"
     out = profile.parent / "out"
     profile.write_text(LEARNED)

@@ -59,13 +59,13 @@ def start_steps(params, key) -> jax.Array:
     return jnp.int32(0)
 
 
-def act_by_parameter(params, steps, view, key):
+def return_parameter(params, steps, view, key):
     """Return the parameter as the action."""
     return params, steps + 1
 
 
-def act_by_parameter_too(params, steps, view, key):
-    """Return the parameter as the action, like `act_by_parameter`, but in a different function."""
+def return_parameter_too(params, steps, view, key):
+    """Return the parameter as the action, like `return_parameter`, but in a different function."""
     return params, steps + 1
 
 
@@ -82,7 +82,7 @@ def test_reference_returns_are_in_the_order_of_the_teammates(monkeypatch):
     monkeypatch.setattr(references, "roll_out", with_fake_rewards)
     monkeypatch.setitem(references.REFERENCE_EGOS, "oracle", other)
     monkeypatch.setattr(references, "KEPT_STEPS", 3)
-    actions = {0: act_by_parameter, 2: act_by_parameter_too, 5: act_by_parameter}
+    actions = {0: return_parameter, 2: return_parameter_too, 5: return_parameter}
     mates = [Policy(jnp.int32(action), start_steps, act, "state") for action, act in actions.items()]
     found = reference_returns(LAYOUT, mates, episodes=2)
     stay, random, oracle = found.T

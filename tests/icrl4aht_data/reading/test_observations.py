@@ -1,4 +1,4 @@
-"""Test releases of observations, which are converted from published files without state records."""
+"""Test releases with observations instead of state records, converted from published files without state records."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ OPTIONS: dict[str, Any] = {"batch_size": 32, "length": 2 * LENGTH + 7, "seed": 2
 
 
 def next_step(step: int, every: int) -> int:
-    """Return the step after `step` in a window of every n-th episode."""
+    """Return the step after `step` in a window that has only every n-th episode."""
     after = step + 1
     return after if after % LENGTH else after + (every - 1) * LENGTH
 

@@ -19,10 +19,10 @@ from icrl4aht_generation.learners.population.population import Algorithm, Assign
 
 
 def pairs_assignment(members: int, environments: int) -> Assignment:
-    """Return the assignment of confederates and best responses.
+    """Return which of K confederates and K best responses play in each environment.
 
-    Term i * K + j is the return of confederate i with best response j in the confederate's objective. Term
-    K * K + i * K + j is this return in the best response's objective.
+    The return of confederate i with best response j is in the objectives of both. Its term is i * K + j in the
+    confederate's objective, and K * K + i * K + j in the best response's objective.
 
     Raises:
         ValueError: if a confederate has fewer environments for cross-play than there are other best responses.

@@ -180,7 +180,7 @@ def _step(scene: Scene, target: Int[Array, ""], cramped: Bool[Array, ""]) -> Int
     """Return the step towards a target; on a cramped layout, agents prefer opposite corners and avoid each other."""
     x, y = jnp.asarray(scene.tables.column), jnp.asarray(scene.tables.row)
     width, height = jnp.asarray(scene.tables.size)
-    # A cost of a tenth of a step for each cell breaks ties between access cells at equal distance.
+    # Of equally near access cells, choose the one nearest to the agent's corner: each cell of distance costs 0.1 steps.
     corner = y + x if scene.slot == 0 else (height - y) + (width - x)
     step, _ = scene.approach(target, jnp.where(cramped, np.float32(0.1) * corner, np.float32(0)))
     if scene.slot == 1:
