@@ -120,7 +120,7 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> Path:
         job.train(run, done=show_steps(show, "Hybrid-AD", training.steps))
     click.echo(f"losses on training and held-out histories: {run / RUN_CURVES}")
 
-    every = bundled_tasks(PREFERENCE, "validation")  # their teammates are new, their dishes are those of the training
+    every = bundled_tasks(PREFERENCE, "validation")  # tasks with new teammates, but dishes of the training tasks
     tasks = settings.tasks or [task for task in every if task.layout.name == DEMO_LAYOUT]
     print_stage(5, f"evaluating it and {', '.join(_AGENTS)} on {len(tasks)} validation tasks")
     agent = find_agent(run, greedy=False)

@@ -209,7 +209,7 @@ def trained_policy(method: Method, params: Any, context: int, mode: PlayMode = A
 def with_channels(policy: Policy, channels: Channels, hide_recipe: bool = False) -> Policy:
     """Return a policy that receives observations with the given channels.
 
-    Policies with equal functions are converted to policies with equal functions, which share one compiled program.
+    If policies have equal functions, the converted policies have equal functions too, and share a compiled program.
 
     Args:
         policy: policy for observations with these channels.

@@ -32,7 +32,7 @@ _Queued = tuple[Sequence[Any], Callable[[Path], Path], Callable[[Path], str]]
 
 
 def _queue_command(out: str, card: str) -> Callable[[Callable[..., _Queued]], Callable[..., None]]:
-    """Return a decorator for a command that trains in a queue of jobs. It adds --out, --bundle and the queue's options.
+    """Return a decorator that adds --out, --bundle and the queue's options to a command that trains in a job queue.
 
     The decorated command returns the jobs and two functions. The first writes the jobs' results into a folder and
     returns the path of the file. The second returns the results in a folder as a table. Results of finished jobs are
@@ -82,8 +82,8 @@ def _ego_options(*own: Callable[[Any], Any], **default_text: str) -> Callable[[A
 def control_command(out: Path) -> None:
     """Check that AD and DPT adapt in context.
 
-    Trains AD and DPT on bandits and Dark Room (about 10 minutes), and checks that they adapt there, and that they do
-    not adapt with their context cut off. Exits with 1 if a check fails.
+    Trains AD and DPT on bandits, and AD in Dark Room (about 10 minutes). Checks that the models adapt, and that they
+    do not adapt with their context cut off. Exits with 1 if a check fails.
     """
     from icrl4aht_baselines.control.control import format_checks, run_control
 
@@ -166,7 +166,7 @@ def best_response_command(
 ) -> _Queued:
     """Train a best response to each teammate.
 
-    An ego with the benchmark's view is trained with a single teammate, by PPO that imitates the oracle in the first
+    An ego with the benchmark's observations is trained with one teammate, by PPO that imitates the oracle in the first
     half of the steps. Teammates that behave the same share one best response. Tasks in which the oracle earns no more
     than `stay` are left out. The best training run is chosen on other episodes than the reported ones. A stored model
     that earns more replaces the trained best response. Writes OUT/best_responses.json and prints a table. Finished
@@ -209,7 +209,7 @@ def adaptation_headroom_command(
     """Estimate what memory across episodes can earn.
 
     Trains two egos on the tasks of each layout. An informed ego observes the task's number in every step; an episodic
-    ego has to find out the teammate in each episode. Prints the difference of their returns, with an interval over the
+    ego has to identify the teammate in each episode. Prints the difference of their returns, with an interval over the
     seeds. The difference is an estimate, because both egos are trained for --steps only. Writes OUT/adaptation.json.
     Finished training runs are reused, and stopped runs resume.
     """

@@ -139,7 +139,7 @@ model_options = dataclass_options(ModelOptions, "model", default_text=_BY_SIZE)
 
 
 def training_summary(histories: dict[str, Any]) -> str:
-    """Return one line on a run's training data (layouts, channels, labels), from its `histories` settings."""
+    """Return one line about a run's training data (layouts, channels, labels), from its `histories` settings."""
     shape, sizes, split = " x ".join(map(str, histories["obs_shape"])), histories["sizes"], histories["teammates_split"]
     held = [f"{sizes['histories']} with the same teammates"] if "histories" in sizes else []
     held += [f"{sizes['teammates']} with others (split {split})"] if split else []
@@ -216,7 +216,7 @@ def prepare_training(
 
 
 def check_conflicts(option: str, *others: str) -> None:
-    """Check that no option in `others` was given on the command line together with `option`, which sets its value.
+    """Check that no option in `others` was given on the command line, because `option` replaces these options.
 
     Raises:
         click.UsageError: if an option was given; the message names all such options.

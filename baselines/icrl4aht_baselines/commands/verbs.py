@@ -6,7 +6,7 @@ _TRAIN, _CHECKS = "Train and evaluate", "Reference models and checks"
 
 
 def _verb(module: str, name: str, section: str, help: str) -> Verb:
-    """Return a command. Its function is named after the last word of `name`, as in `best_response_command`."""
+    """Return the command `name`. The last word of `name` also names the function, as in `best_response_command`."""
     function = name.split()[-1].replace("-", "_")
     return Verb(name, f"icrl4aht_baselines.commands.{module}_commands:{function}_command", section, help)
 

@@ -102,7 +102,7 @@ def dark_room() -> SmallWorld:
 
 
 def best_return(goal: np.ndarray) -> np.ndarray:
-    """Return the highest possible returns in Dark Room, of an agent that walks straight to the goal, float (N,)."""
+    """Return the highest possible returns in Dark Room, float (N,): those of a straight walk to the goal."""
     return ROOM_STEPS + 1.0 - np.maximum(_distance(goal, np.asarray(MIDDLE)), 1)
 
 

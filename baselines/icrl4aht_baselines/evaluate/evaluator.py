@@ -367,15 +367,15 @@ class ControlledResults(NamedTuple):
     @property
     def memory(self) -> Float[np.ndarray, "U S"]:
         """Benefit M of memory: mean return, minus the mean return with the memory cleared before each episode."""
-        return (_return_array(self.plain) - _return_array(self.cleared)).mean(axis=-1)
+        return (_stacked_returns(self.plain) - _stacked_returns(self.cleared)).mean(axis=-1)
 
     @property
     def partner(self) -> Float[np.ndarray, "U S"]:
-        """Benefit P of the right context: return in the last episodes, minus that after another teammate's episodes."""
-        return (_return_array(self.plain) - _return_array(self.swapped))[..., -self.last :].mean(axis=-1)
+        """Benefit P of the right context: last episodes' return minus that return after another teammate's episodes."""
+        return (_stacked_returns(self.plain) - _stacked_returns(self.swapped))[..., -self.last :].mean(axis=-1)
 
 
-def _return_array(results: Sequence[Result]) -> Float[np.ndarray, "U S E"]:
+def _stacked_returns(results: Sequence[Result]) -> Float[np.ndarray, "U S E"]:
     return np.array([result.returns for result in results], np.float64)
 
 
@@ -400,7 +400,7 @@ def evaluate_controls(
             a task has no partner.
     """
     rules = protocol if isinstance(protocol, Protocol) else get_protocol(protocol)
-    plan_tasks(tasks, rules, "swapped")  # reports a task without a partner now, not after hours
+    plan_tasks(tasks, rules, "swapped")  # reports a task without a partner task now, not after hours
     # Only equal functions share compiled programs, and some `make_ego` return new functions in each call.
     make = make_ego if make_ego in SCRIPTED else cache(make_ego)
     options = {"programs": ProgramCache()} | options

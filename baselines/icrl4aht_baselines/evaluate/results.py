@@ -47,7 +47,7 @@ def result_path(out: Path, task_id: str) -> Path:
 
 
 def find_results(out: Path, planned: Sequence[PlannedTask], settings: dict[str, Any]) -> dict[str, Result]:
-    """Return the stored results in a folder of the planned tasks, by task id; other tasks are left out.
+    """Return the planned tasks' results that a folder contains, by task id; tasks without a result are left out.
 
     Args:
         out: folder of results.

@@ -26,7 +26,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, with_recipes
 
-EGO_STEPS, TEAMMATE_STEPS = 2, 3  # numbers of random key streams; streams 0 and 1 are for the agents' memories
+EGO_STEPS, TEAMMATE_STEPS = 2, 3  # numbers to fold into random keys; 0 and 1 are for the agents' memories
 
 
 class RolloutState(NamedTuple):
@@ -94,11 +94,13 @@ class EvaluationRollout:
 
     def start(self, keys: jax.Array) -> RolloutState:
         """Return the state before the first episode, from the random keys of the tasks (B,)."""
-        return RolloutState(self.env.init(keys, self._layout_numbers()), self._begin(keys), no_outcome(keys.shape[0]))
+        return RolloutState(
+            self.env.init(keys, self._layout_numbers()), self._initial_memories(keys), no_outcome(keys.shape[0])
+        )
 
     def clear_memory(self, state: RolloutState) -> RolloutState:
         """Return a state between two episodes in which the egos' memories are reset to those of a new task."""
-        return state._replace(ego=self._begin(state.env.key), before=no_outcome(state.env.key.shape[0]))
+        return state._replace(ego=self._initial_memories(state.env.key), before=no_outcome(state.env.key.shape[0]))
 
     def move_to_layouts(self, state: RolloutState) -> RolloutState:
         """Return another rollout's state between two episodes, moved to the layouts of this rollout.
@@ -109,7 +111,7 @@ class EvaluationRollout:
         record = self.env.first_record(state.env.key, state.env.episode, numbers)
         return state._replace(env=state.env._replace(record=record, layout=numbers))
 
-    def _begin(self, keys: jax.Array) -> Any:
+    def _initial_memories(self, keys: jax.Array) -> Any:
         """Return the egos' memories before the first episode."""
         ego_keys = _fold_keys(keys, EGO)
         if isinstance(self.ego, HostPolicy):
@@ -129,7 +131,7 @@ class EvaluationRollout:
         return jax.vmap(self.ego.act, in_axes=(None, 0, 0, 0))(params, state.ego, view, keys)
 
     def episode(self, ego_params: Any, mate_params: Any, state: RolloutState) -> tuple[RolloutState, EpisodeBatch]:
-        """Play one episode of every task. Return the state after it, and the episode. Callers compile this method."""
+        """Play one episode of every task. Return the next state and the episode. Callers compile this method."""
         mate = self.teammates[0]
         # In each episode teammates start with a new memory, while egos keep theirs.
         keys = self.env.episode_key(state.env)
@@ -158,7 +160,7 @@ class EvaluationRollout:
 
 @lru_cache(maxsize=64)
 def _protocol_layout(layout: Layout, protocol: Protocol) -> Layout:
-    """Return a layout with four recipes if the protocol requires them; other recipes than the published ones stay."""
+    """Return a layout, with four recipes if the protocol requires them and the layout has its published recipes."""
     published = LAYOUTS.get(layout.name)
     four = protocol.four_recipes and any(layout.name in names for names in TRACKS["layout"].values())
     if not four or published is None or layout.recipes != published.recipes:
@@ -214,7 +216,7 @@ class ProgramCache:
         policies = [(policy.init, policy.act, policy.sees) for policy in (rollout.ego, rollout.teammates[0])]
         layouts = rollout.layout if isinstance(rollout.layout, Layout) else tuple(rollout.layout)
         shapes = tuple((np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves)
-        rules = rollout.protocol.steps, rollout.protocol.four_recipes  # states and policies cover all other rules
+        rules = rollout.protocol.steps, rollout.protocol.four_recipes  # other rules only change states and policies
         key = layouts, rules, *policies, structure, shapes
         with self._lock:
             lock = self._locks.setdefault(key, Lock())

@@ -1,4 +1,4 @@
-"""Algorithm Distillation (paper, App. E.2): predict the source algorithm's next action from the history before it.
+"""Algorithm Distillation (paper, App. E.2): predict the source algorithm's next action from the preceding history.
 
 Shapes: `B` batch size, `L` length of a window, `D` width, `N` entries of an observation.
 """

@@ -138,7 +138,7 @@ class DPT(nn.Module):
 
 
 def _repeat_in_turn(values: Shaped[Array, "B Q ..."], length: int) -> Shaped[Array, "B K+1 ..."]:
-    """Return a value for each of the K + 1 prefixes of a context, K = `length`: value j mod Q for prefix j."""
+    """Repeat Q values in turn for the K + 1 prefixes of a context, K = `length`: value j mod Q for prefix j."""
     return values[:, jnp.arange(length + 1) % values.shape[1]]
 
 

@@ -34,7 +34,7 @@ class World(NamedTuple):
     """Description of the environment that a model acts in.
 
     Attributes:
-        encoder: function from a dtype to the encoder, a module from observations or the output of `view` to features.
+        encoder: function of a dtype that returns a module from the output of `view` (or observations) to features.
         obs_shape: shape of one observation.
         view: function that returns the encoder's input for a batch.
         actions: number of actions.
@@ -102,7 +102,7 @@ def compute_dtype(options: ModelOptions) -> Any:
 
 
 def make_transformer(options: ModelOptions) -> Transformer:
-    """Return the transformer with the architecture that the options state."""
+    """Return a transformer with the architecture of the options."""
     return Transformer(options.layers, options.width, options.heads, options.dropout, options.positions, options.remat)
 
 
@@ -155,7 +155,7 @@ def cross_entropy(logits: Float[Array, "*B A"], action: Int[Array, "*B"], smooth
 def mean_of_rows(values: Float[Array, "B L"], mask: Bool[Array, "B L"]) -> Float[Array, ""]:
     """Return the mean of a loss over valid positions in each row (1/|M| in the paper), then over rows.
 
-    All rows have the same weight, so the loss of a batch is the mean of the losses of its parts.
+    All rows have the same weight, so the loss of a batch is the mean of the losses of equally large parts.
     """
     return (jnp.where(mask, values, 0.0).sum(axis=1) / jnp.maximum(mask.sum(axis=1), 1)).mean()
 

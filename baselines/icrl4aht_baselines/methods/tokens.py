@@ -30,7 +30,7 @@ class StepInput(NamedTuple):
     """Input of an ego before an action. Before a history's first step all `prev_*` fields are zero (paper, App. E.2).
 
     Attributes:
-        obs: (*B, ..), the ego's observation, uint8 or float, or another form of it that the encoder takes.
+        obs: (*B, ..), the ego's observation, uint8 or float, or another form that the encoder takes.
         prev_action: int32 (*B,), the ego's action in the previous step.
         prev_reward: float32 (*B,), the team's reward in the previous step, unscaled.
         prev_teammate_action: int32 (*B,), the teammate's action in the previous step; None without +TA.

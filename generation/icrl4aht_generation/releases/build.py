@@ -119,7 +119,7 @@ def train_teammates(
         if earned is None or earned.egos_differ:
             units.append(work)
         elif work.learner == 0:
-            reason = f"the ego does not matter: {earned.describe()}"
+            reason = f"no headroom: {earned.describe()}"
             console.print(f"{work.task.task_id}: left out, {reason}")
             task, name = work.task, teammate_name(work.task)
             left_out.append(LeftOutTask(task.task_id, task.layout.name, name, work.source, 0, 0, None, None, reason))

@@ -48,7 +48,7 @@ class TaskHistories(NamedTuple):
     Attributes:
         task: task of the histories.
         source: how the histories were made.
-        folders: folder of the artefact of each learner.
+        folders: artefact folder of each learner.
         returns: for each learner float64 (N, E), episode returns of its streams.
         streams: for each learner int (n,), numbers of the selected streams, best first.
         least_improvement: minimum improvement of a selected stream; None for no minimum.
@@ -86,16 +86,16 @@ def select_histories(
 ) -> TaskHistories | LeftOutTask:
     """Select the histories of a task for a release.
 
-    All scripted histories and the best streams of learners are selected. On layouts with headroom,
-    `profile.least_improvement` also removes streams with a smaller improvement, and tasks with a teammate that makes
-    the ego's actions irrelevant; `profile.least_rise` removes tasks with a smaller mean improvement.
+    All scripted histories and the best streams of learners are selected. Two minimums of the profile apply only to
+    layouts with headroom. `least_improvement` removes streams with a smaller improvement, and tasks in which the
+    returns of the reference egos hardly differ. `least_rise` removes tasks with a smaller mean improvement.
 
     Args:
         artefacts: folder of the finished artefacts.
         units: the task's units of work.
         profile: profile of the release.
         facts: facts about the teammate.
-        headroom: whether the ego matters with any teammate of the profile on this layout.
+        headroom: whether the reference egos' returns differ for at least one of the profile's teammates on this layout.
     """
     task, source = units[0].task, units[0].source
     folders = [artefacts / work.name for work in units]
@@ -108,8 +108,7 @@ def select_histories(
     found = TaskHistories(task, source, folders, returns, streams, least)
     if least is not None and not facts.references.egos_differ:
         return found.left_out(
-            f"the ego does not matter: returns of these egos differ by less than {LEAST_HEADROOM:g}: "
-            f"{facts.references.describe()}"
+            f"no headroom: returns of these egos differ by less than {LEAST_HEADROOM:g}: {facts.references.describe()}"
         )
     if not len(found.kept_returns):
         return found.left_out(f"the learners did not learn: no stream's end exceeds its start by {least or 0:g}")
@@ -236,11 +235,11 @@ def _population_record(
 def _new_task(
     found: TaskHistories, profile: Profile, suite: Path, facts: TeammateFacts, recorded: Mapping[str, Provenance]
 ) -> NewTask:
-    """Return a task with labels: actions of a learner's checkpoint, or of the script before random actions."""
+    """Return a task labelled with the actions of a learner's checkpoint, or with the script's choices before noise."""
     task, metadata = found.task, json.loads((found.folders[0] / METADATA).read_text(encoding="utf-8"))
     files, labeller = checkpoint_files(suite, task), None
     if found.source in SCRIPTED_SOURCES:
-        expert, own = _script_labels(found.source, facts.references), {"noise": metadata["noise"]}
+        expert, own = _script_label_record(found.source, facts.references), {"noise": metadata["noise"]}
     else:
         labeller, expert = choose_labeller(found.folders, task, suite)
         files |= expert_files(labeller, str(expert.policy_sha256)) if profile.policies else {}
@@ -261,7 +260,7 @@ def _new_task(
         expert=expert,
         **own,
     )
-    # Store the oracle's actions if the oracle earns at least the histories' final return, or gives the labels.
+    # Store the oracle's actions if the oracle earns at least the histories' final return, or if they are the labels.
     with_oracle = profile.oracle_actions and made.is_oracle_useful(float(curve_ends(found.kept_returns)[1].mean()))
 
     def load() -> Iterator[NewHistory]:
@@ -277,7 +276,7 @@ def _new_task(
     return NewTask(task, made, len(found.kept_returns), load, files)
 
 
-def _script_labels(source: str, references: ReferenceEgos) -> ExpertLabels:
+def _script_label_record(source: str, references: ReferenceEgos) -> ExpertLabels:
     """Return the provenance record of labels that are a script's actions."""
     if source == "noise":
         action = "scripted oracle, which sees the full state"
@@ -286,7 +285,7 @@ def _script_labels(source: str, references: ReferenceEgos) -> ExpertLabels:
 
 
 def _label_function(found: TaskHistories, labeller: Path | None) -> Callable[[int, np.ndarray], np.ndarray]:
-    """Return a function from a stream's number and states, uint8 (T, S), to its expert actions, int8 (T,)."""
+    """Return a function from a stream's number and states, uint8 (T, S), to expert actions, int8 (T,)."""
     if labeller is None:
         script = np.load(found.folders[0] / "script_actions.npy", mmap_mode="r")
         return lambda stream, states: script[stream]

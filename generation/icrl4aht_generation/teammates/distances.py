@@ -3,8 +3,8 @@
 
 The common states of a heuristic family on a layout are from 20 episodes of 100 steps with each of its five test
 instances, ten with a random ego and ten with the scripted ego `oracle`. A teammate's distance to a test instance is
-measured on the states of the instance's family. The layouts asymm_both and cramped_up have no test tasks: there the
-instances of the layout on which their models are tested act on the training layout.
+measured on the states of the instance's family. The layouts asymm_both and cramped_up have no test tasks. On these
+two layouts, the instances of asymm_right and cramped_down play (`TESTED_ON`).
 
 `fill_table` measures the teammates of `teammates.draws`, or chooses and measures the teammates of `teammates.spread`.
 """
@@ -106,7 +106,7 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
 
 @lru_cache(maxsize=2)
 def common_states(layout: Layout, episodes: int = _EPISODES) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
-    """Return the states of a layout on which teammates are compared, and the actions of the test instances.
+    """Return the states on which a layout's teammates are compared, and the actions of the test instances.
 
     Args:
         layout: layout of the states.
@@ -123,7 +123,10 @@ def common_states(layout: Layout, episodes: int = _EPISODES) -> tuple[UInt8[Arra
 
 
 def instance_policies(layout: Layout) -> list[Policy]:
-    """Return the test instances for models trained on a layout, by family and number; they see a `Situation`."""
+    """Return the test instances for a layout, by family and number, as policies that see a `Situation`.
+
+    For a training layout, these are the instances of the layout on which its models are tested, see `TESTED_ON`.
+    """
     tested = TESTED_ON.get(layout.name, layout.name)
     entries = [entry for family in TESTED_FAMILIES for entry in published_teammates(tested, family)]
     return [build_teammate(None, entry) for entry in entries]
@@ -304,7 +307,7 @@ def _measure(
 
 
 def _measured_fields(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[str, Any]:
-    """Return the fields that both tables of teammates have: the nearest test instances, and the egos' returns.
+    """Return the fields that `Draw` and `SpreadTeammate` share: nearest test instances, returns of reference egos.
 
     Args:
         family: kind of the teammate.

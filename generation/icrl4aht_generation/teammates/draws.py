@@ -100,9 +100,9 @@ class Draw(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def nearest_compared(self) -> tuple[float, str]:
-        """Distance and name of the test instance with the most similar behaviour, which `admissible` depends on.
+        """Distance and name of the most similar test instance of the family, or of all families for a diverse draw.
 
-        Only test instances of the same family count, or those of all families for a diverse draw.
+        The draw is `admissible` if this distance is large enough.
         """
         own, other = (self.distance, self.nearest), (self.other_distance, self.other)
         diverse = self.base_seed in _DIVERSE_SEEDS.values()
@@ -274,8 +274,8 @@ def unusable_reason(layout: str, family: str, base_seed: int = 0) -> str:
         return f"all {len(draws)} draws act like {tests} (distance {farthest:.3f} at most)"
     widest = max(draw.spread for draw in admissible)
     return (
-        f"with none of the {len(admissible)} draws that act unlike those of the test does the ego matter (returns "
-        f"differ by {widest:.1f} at most)"
+        f"none of the {len(admissible)} draws that act unlike the test teammates has headroom (returns differ by "
+        f"{widest:.1f} at most)"
     )
 
 

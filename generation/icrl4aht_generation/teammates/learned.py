@@ -32,7 +32,7 @@ def build_learned(layout: Layout, folder: Path, action: Action = "greedy") -> Po
     Args:
         layout: layout on which the policy plays.
         folder: folder of the checkpoint, see `learners.checkpoint`.
-        action: how the policy acts, greedily or at random.
+        action: "greedy" to take the most probable action, "sampled" to sample an action.
 
     Raises:
         OptionError: if the folder is not a checkpoint, or its shapes do not match the layout's observations.

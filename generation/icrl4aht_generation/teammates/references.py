@@ -68,7 +68,7 @@ def play_reference_egos(
     keys: Key[Array, " N"],
     field: Literal["record", "reward"],
 ) -> Array:
-    """Play episodes of 100 steps of reference egos with teammates.
+    """Play reference egos with teammates in episodes of 100 steps.
 
     Args:
         layout: layout of the episodes.
@@ -95,7 +95,7 @@ def play_reference_egos(
 def _compiled_play(
     families: tuple[tuple[tuple[int, ...], Policy], ...], pairs: tuple[tuple[str, int], ...], field: str
 ) -> Callable[..., Array]:
-    """Return a compiled function of the layout's tables, the parameters of the oracle and of each family, and keys."""
+    """Return a compiled function from tables, parameters of oracle and families, and keys to a field of the rollout."""
     ego_of, mate_of = (np.array(column) for column in zip(*pairs, strict=True))
 
     @jax.jit

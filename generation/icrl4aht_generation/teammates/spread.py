@@ -204,7 +204,7 @@ def spread_teammates(layout: str, split: str, count: int) -> list[dict[str, Any]
 def find_measured(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
     """Return the measurements of a teammate entry from the tables of draws and spreads; None if it was not measured.
 
-    The behaviour of a spread teammate is its number in the layout's list.
+    For a teammate of `spread.jsonl`, `behaviour` is the teammate's number in the layout's list.
     """
     if teammate.get("kind") != "heuristic" or teammate.get("base_seed") != SPREAD_SEED:
         return find_draw(layout, teammate)

@@ -1,4 +1,4 @@
-"""Heuristic family H3 `assembly_line`: fetches ingredients, or plates and delivers soups, with mistakes (App. B.2)."""
+"""Heuristic family H3 `assembly_line`: one role fetches ingredients, one plates and delivers soups (App. B.2)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _HESITATION_FACTORS = (np.arange(10) / 10).astype(np.float32)
 
 
 def act_assembly_line(params, memory: Key[Array, ""], scene: Scene) -> tuple[Int[Array, ""], Key[Array, ""]]:
-    """Return the action of an H3 teammate, and the next random key, which is its only memory."""
+    """Return the action of an H3 teammate, and the next memory, which is a random key."""
     following, u = draw(memory)
     idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _hesitation_factor(scene))
     makes_room = _should_step_aside(scene)
@@ -40,13 +40,13 @@ def act_assembly_line(params, memory: Key[Array, ""], scene: Scene) -> tuple[Int
 
 
 def _hesitation_factor(scene: Scene) -> Array:
-    """Return a factor of the chance to hesitate, float32 in 0..0.9, which is a fixed pattern over the cells."""
+    """Return a factor of the chance to hesitate, float32 in 0..0.9; each cell has a fixed factor."""
     x, y = jnp.asarray(scene.tables.column)[scene.own_cell], jnp.asarray(scene.tables.row)[scene.own_cell]
     return jnp.asarray(_HESITATION_FACTORS)[(7 * x + 13 * y) % 10]
 
 
 def _choose_action(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Return whether the action is exempt from mistakes, and the action of the first rule that applies."""
+    """Choose an action by the first rule that applies. Return whether it is exempt from mistakes, and the action."""
     empty, plate, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_ingredient
     soup, cooking = jnp.any(scene.cooked), jnp.any(scene.cooking)
     final = scene.holds_dish | (ingredient & soup)
@@ -61,7 +61,7 @@ def _choose_action(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Boo
         [
             Rule(scene.holds_dish, scene.goals),
             Rule(scene.holds_ingredient & soup, scene.empty_counters),
-            # Agents put their item down if they give up, or if the item belongs to the other role.
+            # Agents put their item down if they abandon the task, or if the item belongs to the other role.
             Rule((plate | ingredient) & abandons, scene.empty_counters),
             Rule((runner & plate) | (plater & ingredient), scene.empty_counters),
             Rule(runner & ingredient, scene.fillable_pot_cells),

@@ -108,7 +108,7 @@ def _rule_action(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, "
 
 
 def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
-    """Return the step towards a target, around the partner; agent 1 waits for a partner at the only access cell."""
+    """Return the step towards a target, around the partner; agent 1 waits if the partner is at the only access cell."""
     # Thresholds are float32 like the parameters, so a parameter of 0.1 or 0.3 reaches the threshold.
     step, cost = scene.approach(target)
     goes_around = scene.destination(step) == scene.partner_cell

@@ -1,4 +1,4 @@
-"""Heuristic family H4 `utility_greedy`: scores eight intents by weight and distance, follows the best (App. B.2)."""
+"""Heuristic family H4 `utility_greedy`: follows the best of eight intents, scored by weight and distance (App. B.2)."""
 
 from __future__ import annotations
 
