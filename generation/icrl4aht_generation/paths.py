@@ -85,7 +85,7 @@ class ChosenRule(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Features of a state from one agent's view, traced and computed at first use; all masks are bool (cells,).
+    """Features of a state from one agent's view; each is computed at first use, and all masks are bool (cells,).
 
     Attributes:
         tables: tables of the layout.
@@ -201,7 +201,7 @@ class Scene:
 
     @cached_property
     def empty_counters(self) -> Bool[Array, " cells"]:
-        """Mask of walls and counters without an item, also unreachable walls."""
+        """Mask of walls and counters without an item, including unreachable walls."""
         # The published teammates also target unreachable walls; `first` skips rules without a reachable target.
         taken = self.values_on_cells(WALL, self.state.counters > 0)
         return self.cells_of_kind(WALL) & ~taken
@@ -334,7 +334,7 @@ class Scene:
         waits: Bool[Array, ""] | bool = False,
         step: Int[Array, ""] | None = None,
     ) -> Int[Array, ""]:
-        """Return the action that walks to a target, faces the target, and then interacts or waits.
+        """Return the next action to walk to a target, face the target, and then interact or wait.
 
         The argument `step` replaces the step of `approach`.
         """
@@ -370,7 +370,7 @@ class Scene:
         return jnp.where(jnp.any(allowed), jnp.asarray(SEARCH_ORDER)[best], otherwise)
 
     def wander(self, stay_score: int = 50) -> Int[Array, ""]:
-        """Return a step to a free neighbour cell; without one, `stay`, or push the partner if `stay_score` > 100."""
+        """Return a step to a free neighbour cell, else `stay`, or a push of the partner if `stay_score` > 100."""
         target = jnp.asarray(self.tables.moves)[self.own_cell].astype(jnp.int32)
         # As in the published code, pushing costs 100, so a `stay_score` above 100 prefers pushing to staying.
         scores = [

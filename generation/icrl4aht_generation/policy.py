@@ -43,8 +43,8 @@ class Policy(NamedTuple):
         init: (params, key) -> memory, any pytree, at the start of an episode; for egos in evaluation, at the start
             of a task.
         act: (params, memory, view, key) -> action, int32 () in 0..5, and the memory after the step.
-        sees: content of `view`: "state" for the state record, uint8 (S,); "situation" for a `Situation`, by which one
-            policy plays every layout; "observation" for uint8 (5, 5, C);
+        sees: content of `view`: "state" for the state record, uint8 (S,); "situation" for a `Situation`, so one
+            policy can play every layout; "observation" for uint8 (5, 5, C);
             "ego_input", only for egos in evaluation, for the observation with the outcome of the previous step
             (`icrl4aht_baselines.agents.EgoInput`), and "canonical_input" for this input with canonical channels.
     """
@@ -71,7 +71,7 @@ def _act_on_layout(act: Callable[..., Any], layout: Layout) -> Callable[..., Any
 def on_layout(policy: Policy, layout: Layout) -> Policy:
     """Convert a policy that sees a `Situation` into a policy that sees state records of one layout.
 
-    Policies with equal functions still have equal functions afterwards, so they share compilations.
+    Two policies with equal functions also share compilations after the conversion.
     """
     return policy._replace(act=_act_on_layout(policy.act, layout), sees="state")
 

@@ -1,4 +1,4 @@
-"""Run jobs on Ray, which schedules jobs, assigns a GPU to each if the machines have any, and retries failed jobs.
+"""Run jobs on Ray, which schedules jobs, assigns each job a GPU if the machines have GPUs, and retries failed jobs.
 
 If this module starts Ray, Ray listens only on 127.0.0.1, and has no dashboard and no usage reports.
 """

@@ -110,5 +110,5 @@ def split_of(layout: Layout) -> str:
     splits = [split for split in LAYOUT_SPLITS if split != "train" or not has_tested_rooms(layout)]
     digest = hashlib.sha256("\n".join(canonical_map(layout)).encode()).digest()
     ends = np.cumsum([LAYOUT_SPLITS[split] for split in splits])
-    position = int.from_bytes(digest[:6], "big") / 2**48  # below 1, since a float represents six bytes exactly
+    position = int.from_bytes(digest[:6], "big") / 2**48  # never rounded up to 1, as a float stores six bytes exactly
     return splits[int(np.searchsorted(ends, position * ends[-1], side="right"))]

@@ -51,8 +51,8 @@ def needs_no_handover(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tup
 def waiting_cells(grid: np.ndarray, room: np.ndarray, recipes: Sequence[tuple[int, int, int]]) -> np.ndarray:
     """Return the cells of a shared room on which one agent can wait while the other delivers every recipe alone.
 
-    All other cells are the only access to a pot, or to all fixtures of a kind that a recipe needs. Every pot counts,
-    because the scripted expert may wait for a blocked pot. The room must stay connected without any single cell.
+    A cell is left out if it is the only access to a pot, or to all fixtures of a kind that a recipe needs. Every pot
+    counts, because the scripted expert may wait for a blocked pot. The room must stay connected if one cell is blocked.
 
     Args:
         grid: the map, str (H, W).

@@ -1,4 +1,4 @@
-"""Maps as arrays: rooms, mirror images, rotations, and a canonical form of symmetric maps.
+"""Maps as arrays: rooms, mirror images, rotations, and a canonical form of maps that differ only by symmetry.
 
 Shapes: `H` rows, `W` columns. A grid is an array (H, W) of map letters, see `icrl4aht_data.overcooked.layouts`.
 """
@@ -47,7 +47,7 @@ def symmetric_images(grid: np.ndarray) -> list[np.ndarray]:
 
 @lru_cache(maxsize=64)
 def _wide_images(height: int, width: int) -> tuple[np.ndarray, int]:
-    """Return the cell order of all symmetric images not taller than wide, int (images, cells), and their width.
+    """Return the cell numbers of each symmetric image not taller than wide, int (images, cells), and its width.
 
     A square map has eight such images, any other map four.
     """
@@ -71,16 +71,16 @@ def canonical_map(layout: Layout) -> tuple[str, ...]:
     letters[every, start] = ord("A")
     second[every, start] = False
     letters[every, second.argmax(axis=1)] = ord("A")
-    return _first_rows(letters, width)
+    return _first_map(letters, width)
 
 
 def canonical_floor(floor: np.ndarray) -> tuple[str, ...]:
     """Return the alphabetically first mirror image or rotation of a floor, bool (H, W), not taller than wide."""
     images, width = _wide_images(*floor.shape)
-    return _first_rows(np.where(floor.ravel()[images], ord(" "), ord("W")).astype(np.uint8), width)
+    return _first_map(np.where(floor.ravel()[images], ord(" "), ord("W")).astype(np.uint8), width)
 
 
-def _first_rows(images: np.ndarray, width: int) -> tuple[str, ...]:
-    """Return the rows of the alphabetically first of several maps of equal width, uint8 (maps, cells)."""
+def _first_map(images: np.ndarray, width: int) -> tuple[str, ...]:
+    """Return the alphabetically first of several maps, uint8 (maps, cells), as rows of the given width."""
     text = min(image.tobytes() for image in images).decode("ascii")
     return tuple(text[start : start + width] for start in range(0, len(text), width))

@@ -59,7 +59,7 @@ def _can_deliver(
     numbers: np.ndarray,
     tries: Sequence[tuple[int, tuple[bool, bool], bool]],
 ) -> Bool[np.ndarray, " numbers"]:
-    # All batches share one compilation, because the largest layouts in each batch give its arrays equal shapes.
+    # Every batch includes the largest layouts, so arrays have equal shapes and all batches share one compilation.
     own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
     # Computing `LayoutFacts` takes longer than an episode, so all tries of a batch share the result.

@@ -54,7 +54,7 @@ def rearranged_layouts(layout: Layout, count: int) -> list[Layout]:
 def draw_rearranged(seed: int) -> Iterator[LayoutDraw]:
     """Yield rearranged versions of the layout track's training layouts, one version of each layout in turn.
 
-    With seed 0, the versions of each layout are its `rearranged_layouts`.
+    With seed 0, the versions of each layout are those that `rearranged_layouts` returns.
     """
     for versions in zip(*(_arrangements(get_layout(name), seed) for name in TRACKS["layout"]["train"]), strict=False):
         yield from ((one.rows, one.recipes, one.indicates_delivery) for one in versions)

@@ -100,7 +100,7 @@ class Learner:
         players = self.players(state.params, state.teammate)
         carry, rollout = roll_out(self.env, players, state.carry, self.config.rollout, play_key)
         ego = players[EGO]
-        # Only the value of the state after the rollout is used; the next rollout draws its own action.
+        # Only the critic's value of the last state is used; the next rollout draws a new action in this state.
         after, _ = ego.act(carry.memories[EGO], carry.env, play_key)
         shaping = shaping_weight(self.config, state.update)
         memory, forgiveness = state.carry.memories[EGO], self.config.forgiveness

@@ -147,7 +147,7 @@ def group_equal(seen: Seen) -> Seen:
     group_of_sorted = jnp.cumsum(starts, dtype=jnp.int32) - 1
     group = jnp.zeros_like(number).at[order].set(group_of_sorted, unique_indices=True)
     first = jnp.zeros_like(number).at[jnp.where(starts, group_of_sorted, len(ids))].set(order, mode="drop")
-    # Different observations rarely have equal hashes, but this test prevents that they are merged silently.
+    # This test detects different observations with equal hashes, which would otherwise be merged silently.
     exact = (ids[first[group]] == ids).all()
     first, group = (jnp.where(exact, found, number) for found in (first, group))
     count = jnp.where(exact, group_of_sorted[-1] + 1, len(ids))
@@ -282,7 +282,7 @@ class Conv3x3(nn.Module):
         channels = x.shape[-1] // VISIBLE
         kernel = self.param("kernel", nn.initializers.orthogonal(2**0.5), (3, 3, channels, self.features))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
-        # A zero follows the nine kernel weights; pairs of cells that are more than one cell apart use it.
+        # Tap 9 is a zero after the nine kernel weights, for pairs of cells that are more than one cell apart.
         taps = jnp.concatenate([kernel.reshape(9, channels, self.features), jnp.zeros_like(kernel[:1, 0])])
         matrix = taps[_tap_of_cells()].transpose(0, 2, 1, 3).reshape(VISIBLE * channels, VISIBLE * self.features)
         return x @ matrix + jnp.tile(bias, VISIBLE)

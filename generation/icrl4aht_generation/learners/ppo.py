@@ -1,9 +1,9 @@
 """Recurrent PPO for egos and populations (paper, App. B.1 and C.2).
 
-T denotes the steps of a rollout, M the agent slots of one policy: pairs of an environment and one of its two agents
-that the policy controls. A sequence is the T steps of one slot. Minibatches consist of complete sequences, because the
-recurrent states are computed again from the state before the first step. The network's inputs are computed once per
-rollout. The algorithms for egos and populations differ only in the partner and in the weight of each advantage.
+T denotes the steps of a rollout, M the agent slots of one policy. An agent slot is one agent of one environment. A
+sequence is the T steps of one slot. Minibatches consist of complete sequences, because the recurrent states are
+computed again from the state before the first step. The network's inputs are computed once per rollout. The algorithms
+for egos and populations differ only in the partner and in the weight of each advantage.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def sequences(
     """
     agent, env = np.divmod(agent_slots, rollout.done.shape[1])
     choice = rollout.choices[player]
-    # A wrong delivery costs more than two button presses, so a reward below two presses means a wrong delivery.
+    # A reward below that of two button presses, one by each agent, means a wrong delivery.
     shaped = rollout.shaped[:, env, agent] + forgiveness * (rollout.reward[:, env] < 2 * PRESS_REWARD)
     return Sequences(
         seen=view(slot_records(rollout.record, agent_slots)),
@@ -142,7 +142,7 @@ class PPO:
     ) -> tuple[Any, optax.OptState, dict[str, Array]]:
         """Update a policy with `config.epochs` passes over the sequences of one rollout.
 
-        Minibatches have equal size; every epoch skips the sequences that remain after shuffling.
+        Minibatches have equal size; if the sequences do not divide evenly, every epoch skips a few random ones.
 
         Args:
             params: parameters of the network.

@@ -249,7 +249,7 @@ def slot_records(record: UInt8[Array, "*B N S"], agent_slots: np.ndarray) -> UIn
     """
     n = record.shape[-2]
     agent, env = np.divmod(agent_slots, n)
-    if not agent.any():  # the egos of all environments in order need no indexing
+    if not agent.any():  # no indexing if the slots are the egos of all environments in order
         return record if np.array_equal(env, np.arange(n)) else record[..., env, :]
     own = record[..., env, :]
     return jnp.where((agent == 1)[:, None], swap_agents(own), own)

@@ -75,8 +75,8 @@ def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
         environment_steps: environment steps of all egos that learn.
         scripted_histories: number of histories that a script plays.
         scripted_transitions: number of transitions in scripted histories.
-        recorded_transitions: transitions of all streams and scripted histories, before the stream filter.
-        kept_transitions: maximum number of transitions after the stream filter.
+        recorded_transitions: transitions of all histories of egos and scripts, before histories are selected.
+        kept_transitions: maximum number of transitions after histories are selected.
         artefact_bytes: size of the artefacts of all tasks.
         lite_bytes, full_bytes: sizes of a lite and of a full release.
         device: device on which the networks were measured.
@@ -152,7 +152,7 @@ def cost_rows(cost: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def step_seconds(config: PPOConfig) -> float:
-    """Return the seconds per environment step of a learner for acting, the environment, and all epochs of learning."""
+    """Return a learner's seconds per environment step, for acting, the environment, and all epochs of learning."""
     passes = 1 + _GRADIENT * config.epochs
     # One layout is enough: layouts differ in the number of channels, which only affects the network's first layer.
     return passes * forward_seconds(get_layout("demo_wide"), config) + 1 / ENVIRONMENT_STEPS_PER_SECOND
@@ -166,7 +166,7 @@ def forward_seconds(layout: Layout, config: PPOConfig) -> float:
     network = ActorCritic(config.widths, view=view)
     shapes = jax.eval_shape(lambda key: network.untrained(key, layout.channels), jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    # Equal records imitate training, where most observations are equal and the encoder computes each only once.
+    # Repeated records imitate training, where most observations repeat, and equal ones are encoded only once.
     record = np.random.default_rng(0).integers(0, 256, (steps, 1, record_size(layout)), np.uint8)
     records = jnp.asarray(np.repeat(record, count, axis=1))
     reset = jnp.zeros((steps, count), bool)

@@ -186,7 +186,7 @@ def _matrix_text(names: list[str], values: np.ndarray) -> str:
 def actions_on_common_states(
     layout: Layout, policies: Sequence[Policy], seed: int = 0, steps: int = EPISODE_STEPS
 ) -> np.ndarray:
-    """Return the actions of every policy as the teammate on the same states.
+    """Return the actions that each policy takes, as the teammate, in the same states.
 
     The states are from two episodes of each policy with a uniformly random ego. Every policy acts on every state, with
     the memory of a teammate that observed the episode up to this state.

@@ -1,4 +1,4 @@
-"""Cross-play of learned policies: mean returns of pairs over complete training episodes in one compiled rollout."""
+"""Cross-play of learned policies: mean returns of pairs over episodes of 400 steps, in one compiled rollout."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ class PopulationRun:
 
     @cached_property
     def stages(self) -> list[Population]:
-        """Successive stages of training; in each stage CoMeDi trains one policy, the first policy by self-play."""
+        """Successive stages of training: for CoMeDi one for each policy, the first by self-play; otherwise only one."""
         env = Environment(self.layout)
         if self.algorithm == "comedi":
             first = Population(env, FCP(1), self.config, partners=2)
@@ -311,7 +311,7 @@ class _PopulationTraining:
         }
 
     def _with_nearest_member(self, params: Any, stage: int, number: int) -> Any:
-        """Return the parameters with a new frozen policy: the former member that plays best with the new member.
+        """Return the parameters with the frozen policy replaced by the new member's best partner among former members.
 
         Source: paper, App. B.1, "Partner Selection".
         """
@@ -351,7 +351,7 @@ class _PopulationTraining:
             }
             own = jax.tree.map(lambda leaf, k=k: leaf[k], members)
             save_policy(self.folder / f"m{stage + k}" / f"c{checkpoint}", population.network, own, card)
-            # Save only final best responses, which show the return that is possible with a teammate.
+            # Save best responses only at the end; they show the return that is possible with a teammate.
             if run.has_best_responses and checkpoint == POLICY_CHECKPOINTS - 1:
                 response = jax.tree.map(lambda leaf, k=k: leaf[k], partners)
                 path = self.folder / RESPONSES / f"m{k}"

@@ -60,7 +60,7 @@ class _Generated(Struct, forbid_unknown_fields=True):
     Attributes:
         family, seed, count, split: arguments of `generate_layouts`.
         teammates: number of tasks of each layout in the sources "ppo" and "noise".
-        dishes: number of tasks of each layout without recipe indicators in the source "search".
+        dishes: number of tasks in the source "search" of each layout on which the ego cannot see the recipe.
     """
 
     family: str
@@ -173,8 +173,8 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
     _check_known("layout of the track preference", "tasks.preference", preference, PREFERENCE_LAYOUTS["train"])
     if bool(preference or dishes) != ("search" in sources):
         raise OptionError(
-            f"tasks.preference = {list(tasks.preference)}, tasks.sources = {list(sources)}: expected layouts in "
-            f"tasks.preference, or dishes in tasks.generated, if tasks.sources contains search, and none otherwise"
+            f"tasks.preference = {list(tasks.preference)}, tasks.sources = {list(sources)}: the source "
+            f"search needs layouts in tasks.preference or dishes in tasks.generated; without this source, remove both"
         )
     if "ppo" not in sources:
         release.keep = 0

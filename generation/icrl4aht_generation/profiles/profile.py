@@ -31,7 +31,7 @@ from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_te
 from icrl4aht_generation.teammates.spread import SPREAD_SEED, spread_teammates
 
 LEAST_EPISODES = 5
-"""Minimum number of episodes of a stream, because its initial and final returns are means over five episodes."""
+"""Minimum number of episodes of a history, because its initial and final returns are means over five episodes."""
 
 VALIDATION_DRAWS = 1
 """Base seed of sampled validation teammates; training teammates have base seed 0, so the splits share no teammate."""
@@ -90,11 +90,11 @@ class TeammateConfig:
 
 @dataclass(frozen=True)
 class SpreadConfig:
-    """Numbers of heuristic teammates that differ widely, see `teammates.spread`.
+    """How many widely different heuristic teammates to choose, see `teammates.spread`.
 
     Attributes:
         per_layout: number of training teammates by layout; the source "noise" uses all of them.
-        ppo: number of training teammates by layout that the source "ppo" uses, the first in the list.
+        ppo: number of training teammates by layout that the source "ppo" uses, counted from the first.
         validation: number of validation teammates by layout, which only the source "noise" uses.
     """
 
@@ -141,13 +141,13 @@ class Profile:
         ego: hyper-parameters of the egos.
         teammates: sizes and hyper-parameters of the learned teammates.
         data_version: version of the release, SemVer.
-        keep: number of streams of each task that the release contains, best first.
+        keep: maximum number of histories of each task of the source "ppo" in the release, best first.
         layouts: names of the layouts.
         sources: how histories are made: "ppo", "noise" and "search", one or more.
         learners: number of independent learners of each task of the source "ppo".
         presets: presets of the heuristic H4 `utility_greedy`, which are teammates on all `layouts`.
         sampled: numbers of heuristic teammates with sampled parameters.
-        spread: numbers of heuristic teammates that differ widely, on layouts without sampled teammates.
+        spread: numbers of widely different heuristic teammates, on layouts without sampled teammates.
         algorithms: algorithms of the learned teammates by layout.
         ego_layouts: hyper-parameters of the egos by layout, for layouts with other values than `ego`.
         noise: options of histories of the source "noise".
@@ -159,10 +159,10 @@ class Profile:
             `preference` on these layouts.
         policies: whether the release contains the policies that label the histories.
         oracle_actions: whether the release contains the scripted oracle's action at every step.
-        least_improvement: minimum improvement from the initial to the final return of a stream in the release; None for
-            no minimum.
+        least_improvement: minimum improvement from the initial to the final return of an ego's history in the release;
+            None for no minimum.
         least_rise: minimum mean improvement of a task's histories for a task in the release; None for no minimum.
-            Neither minimum applies to layouts where the ego matters with no teammate.
+            Neither minimum applies to a layout where reference egos earn about the same with every teammate.
         xla_threads: number of CPU threads of XLA, which gives equal bits on every machine; None for all cores.
 
     Raises:
@@ -202,7 +202,7 @@ class Profile:
                 raise OptionError(f"release.keep = {self.keep}: expected 1..{ego.environments * self.learners}")
             if ego.episodes < LEAST_EPISODES:
                 raise OptionError(
-                    f"ego.total_steps gives {ego.episodes} episodes in a stream, expected at least {LEAST_EPISODES}"
+                    f"ego.total_steps gives {ego.episodes} episodes in a history, expected at least {LEAST_EPISODES}"
                 )
 
     def with_ego(self, given: Mapping[str, Any]) -> Profile:
@@ -312,7 +312,7 @@ class Profile:
         ]
 
     def _dish_tasks(self, layout: str) -> list[Task]:
-        """Return the tasks of a generated layout that want one dish each; families and dishes take turns."""
+        """Return tasks with one wanted dish each on a generated layout; teammate families and dishes take turns."""
         split, wanted = split_of(get_layout(layout)), training_dishes(get_layout(layout))
         first, numbers = _first_generated_seed("search", layout, self.dishes), _generated_numbers(layout, self.dishes)
         mates = _generated_teammates(layout, split, self.dishes)
@@ -330,7 +330,7 @@ class Profile:
 
 
 def _generated_numbers(layout: str, generated: Mapping[str, int]) -> range:
-    """Return the numbers of a generated layout's tasks, counted over all generated layouts."""
+    """Return the task numbers of a generated layout, which continue those of the previous generated layouts."""
     first = sum(generated[name] for name in takewhile(layout.__ne__, generated))
     return range(first, first + generated[layout])
 
@@ -345,7 +345,7 @@ def _generated_teammates(layout: str, split: str, generated: Mapping[str, int]) 
 
 
 def _first_generated_seed(source: str, layout: str, generated: Mapping[str, int]) -> int:
-    """Return the seed of the first task of a source on a generated layout; other layouts have other seeds."""
+    """Return the first seed for a source's tasks on a generated layout; other layouts have other seeds."""
     return _first_seed(source) + _GENERATED_SEEDS + list(generated).index(layout) * _LAYOUT_TEAMMATES
 
 
@@ -358,7 +358,7 @@ def _drawn_task_seed(layout: str, source: str, entry: Mapping[str, Any]) -> int:
 
 
 def _task_of_source(task: Task, source: str) -> Task:
-    """Return a task of a preset or learned teammate with a seed for its source; for "ppo" the seed does not change."""
+    """Return a task with a preset or learned teammate, with a new seed for the given source unless it is "ppo"."""
     if source == "ppo":
         return task
     seed = _first_seed(source) + _UNSAMPLED_SEEDS + task.seed

@@ -102,7 +102,7 @@ def train_teammates(
 
     Returns:
         The units, the returns of reference egos with learned teammates by task id, and the tasks that are left out
-        because the ego's actions do not matter.
+        because all reference egos earn about the same.
 
     Raises:
         FailedJobsError: if no task remains, because no teammate is good enough.

@@ -70,14 +70,14 @@ def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceE
 
 
 def _training_partner(folder: Path) -> Path:
-    """Return the folder of the training partner of a checkpoint m<k>/c<n>: its best response, or the policy itself."""
+    """Return the training partner's folder for a checkpoint folder m<k>/c<n>: a best response, or the same folder."""
     response = folder.parent.parent / RESPONSES / folder.parent.name
     return response if response.is_dir() else folder
 
 
 @lru_cache(maxsize=8)
 def _compiled_self_play(layout: Layout, ego: Policy, mate: Policy) -> Callable[[Any, Any], jax.Array]:
-    """Return a compiled function of both policies' parameters that plays episodes and gives returns (episodes,)."""
+    """Return a compiled function from both policies' parameters to the returns of their episodes, (episodes,)."""
     env = Environment(layout, KEPT_STEPS)
 
     @jax.jit
@@ -98,7 +98,7 @@ class TeammateFacts(NamedTuple):
 
     Attributes:
         references: returns of the reference egos with the teammate.
-        nearest: test teammate of any family with the most similar behaviour; None if unknown.
+        nearest: the test teammate, of any family, whose behaviour is most similar; None if unknown.
     """
 
     references: ReferenceEgos
@@ -184,7 +184,7 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
     """Measure the returns with teammates of one layout, and the distances of learned teammates to the test teammates.
 
     Distances of heuristics such as presets are not measured, because this would take longer than generating a small
-    release. The card states that the test has teammates of their family.
+    release. The card warns against claims of generalisation to new teammates of these families.
     """
     learned = [task for task in tasks if task.teammate_family == "rl"]
     heuristics = [task for task in tasks if task.teammate_family != "rl"]

@@ -21,8 +21,8 @@ from icrl4aht_generation.learners.population.population import Algorithm, Assign
 def pairs_assignment(members: int, environments: int) -> Assignment:
     """Return which of K confederates and K best responses play in each environment.
 
-    The return of confederate i with best response j is in the objectives of both. Its term is i * K + j in the
-    confederate's objective, and K * K + i * K + j in the best response's objective.
+    The return of confederate i with best response j is term i * K + j in the objective of the confederate, and term
+    K * K + i * K + j in the objective of the best response.
 
     Raises:
         ValueError: if a confederate has fewer environments for cross-play than there are other best responses.

@@ -68,6 +68,6 @@ class CoMeDi(Algorithm):
         )
 
     def weights(self, memory: Any) -> Float[Array, " terms"]:
-        # Both mixed-play terms have half the weight, although the frozen member's term has half as many samples.
+        # The two kinds of mixed play have equal weights, although play with the frozen member has half as many samples.
         half = self.mixed_play_weight / 2
         return jnp.array([1.0, -self.cross_play_weight, half, half])

@@ -25,9 +25,9 @@ class FCP(Algorithm):
     members: int
 
     def assignment(self, environments: int) -> Assignment:
-        """Return the assignment, with one term for each member: the member's self-play return."""
+        """Return the assignment, in which each member has one objective: its self-play return."""
         member = np.repeat(np.arange(self.members), environments)
-        # A member plays both agents, and learns from both slots, which are samples of its self-play return.
+        # A member plays both agents and learns from both, because both earn its self-play return.
         both = np.stack([member, member])
         return Assignment(both, both, np.arange(self.members), self.members, np.full(member.size, -1))
 

@@ -11,14 +11,14 @@ from jaxtyping import Array, Bool, Float
 from icrl4aht_generation.learners.population.brdiv import pairs_assignment
 from icrl4aht_generation.learners.population.population import Algorithm, Assignment
 
-_SELF_PLAY = 0.5  # multiplier on the diagonals, so a member's self-play has a total weight of 1
+_SELF_PLAY = 0.5  # multiplier on both diagonals, so a member's self-play return has at least the weight 1
 
 
 class Multipliers(NamedTuple):
     """Lagrange multipliers of K members, and the returns that determine the multipliers.
 
-    J(pi_i, BR_j) denotes the return of confederate i with best response j. Multiplier [i, j] belongs to the constraint
-    that J(pi_i, BR_i) exceeds another return by the tolerance.
+    J(pi_i, BR_j) denotes the return of confederate i with best response j. Multipliers [i, j] belong to the constraints
+    that J(pi_i, BR_i) exceeds J(pi_j, BR_i) and J(pi_i, BR_j) by the tolerance.
 
     Attributes:
         vertical: float32 (K, K), multipliers for J(pi_j, BR_i), another confederate with i's best response.
@@ -67,7 +67,7 @@ class LBRDiv(Algorithm):
         return jnp.concatenate([pairs.ravel(), pairs.ravel()])
 
     def adapt(self, memory: Multipliers, returns, seen) -> Multipliers:
-        """Return multipliers max(Lambda - eta (J(pi_i, BR_i) - J(other) - eps), 0); the diagonal does not change."""
+        """Return multipliers max(Lambda - eta (J(pi_i, BR_i) - J(other pair) - eps), 0), with the old diagonal."""
         k = self.members
         # `returns` is indexed [ego, teammate]; best responses, K..2K-1, are the egos.
         known = memory.known | seen[k:, :k].T

@@ -32,16 +32,16 @@ from icrl4aht_generation.learners.rollout import Player, Rollout, RolloutCarry, 
 class Assignment(NamedTuple):
     """Fixed assignment of policies to both agents of N environments.
 
-    The objective is a weighted sum of *terms*, which are expected returns. Each slot that a policy learns from is a
-    sample of one term, the return that the policy raises or lowers in this slot.
+    The objective is a weighted sum of *terms*, which are expected returns. Each slot from which a policy
+    learns provides samples of one term: the return that the policy maximizes or minimizes in this slot.
 
     Attributes:
         policy: int (2, N), the policy that plays each agent of each environment.
-        term: int (2, N), the term that each slot is a sample of; -1 for slots from which no policy learns.
+        term: int (2, N), number of the term that each slot samples; -1 for slots from which no policy learns.
         group: int (P,), group of each policy: a pair from one group is self-play, any other pair is cross-play.
         learning: number L of policies that learn.
-        starts_from: int (N,), number of the environment that provides start states by its visited states; -1 for
-            episodes with the usual start.
+        starts_from: int (N,), number of the environment whose visited states start the episodes; -1 for episodes with
+            the usual start.
     """
 
     policy: np.ndarray
@@ -73,7 +73,7 @@ class Assignment(NamedTuple):
 
     @property
     def self_play(self) -> np.ndarray:
-        """Whether the two policies in each environment are of one group, bool (N,)."""
+        """Whether both policies in each environment have the same `group`, bool (N,)."""
         return self.group[self.policy[0]] == self.group[self.policy[1]]
 
 
@@ -110,7 +110,7 @@ class PolicyGroup(NamedTuple):
     Attributes:
         first: number of the first policy.
         agent_slots: int (G, M), slots of each policy; slots from which the policy learns come first.
-        counting: number of slots, of the M slots, from which each policy learns.
+        counting: how many of the M slots each policy learns from.
     """
 
     first: int
@@ -330,12 +330,12 @@ class Population:
         policies = self.assignment.policies
         term, policy = self.assignment.term.ravel(), self.assignment.policy.ravel()  # int (2N,) each
         learned = term >= 0  # bool (2N,)
-        # A term is an expected return, and its slots are samples that share the term's weight.
+        # Slots with the same term are samples of one expected return, and share the weight of this return.
         weights = self.algorithm.weights(memory)  # float32 (terms,)
         samples = np.bincount(term[learned], minlength=len(weights))  # int (terms,)
         shared = weights / np.maximum(samples, 1)  # float32 (terms,)
         raw = jnp.where(learned, shared[term], 0.0)  # float32 (2N,)
-        # Scale the mean weight of each policy to 1, so the learning rate means the same for all algorithms.
+        # Scale the mean absolute weight of each policy to 1, so learning rates are comparable between algorithms.
         total = jnp.zeros(policies).at[policy].add(jnp.abs(raw))  # float32 (P,)
         slots = np.bincount(policy[learned], minlength=policies)  # int (P,)
         scale = slots / jnp.maximum(total, 1e-8)  # float32 (P,)
