@@ -84,8 +84,8 @@ class HubClient:
         unanswered: dict[str, float] = {}
 
         def before_request(request: Any) -> None:
-            # Time is measured per address, since a server may answer some addresses only, and per host, since one call
-            # of the client may send requests to several addresses of a host.
+            # Waiting is timed per address, since a server may answer only some addresses, and also per host, since one
+            # call of the client may request several addresses of a host.
             now, keys = time.monotonic(), (str(request.url), request.url.host)
             first = min(unanswered.setdefault(key, now) for key in keys)
             left = first + _TIMEOUT - now
@@ -226,7 +226,7 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
             if isinstance(error, OSError) and error.errno in (*NO_ROOM, errno.EROFS):
                 raise
             status, cause = _http_status(error), _root_cause(error)
-            # Timeouts are not retried: the user is still waiting for the first output.
+            # Timeouts are not retried, since the user has already waited for the server.
             is_transient = not isinstance(cause, _PERMANENT) and "Timeout" not in type(cause).__name__
             if status is not None:
                 is_transient = status in _TRANSIENT_STATUS or status >= 500

@@ -230,7 +230,7 @@ class Dataset(Selection):
         return chosen
 
     def plot(self) -> Picture:
-        """Return a plot of returns by episode, source and layout, which notebooks display.
+        """Return a plot of returns by episode, source and layout; notebooks display the plot.
 
         Plotting reads the rewards of all selected histories.
 
@@ -248,7 +248,7 @@ class Dataset(Selection):
         """Return the Gymnasium environment of a history: the caller acts as the ego, the environment as the teammate.
 
         Episodes have the length used to make the history, 400 steps in the benchmark; the release keeps the first 100.
-        `reset(options=dataset.reset_options(history_id, episode))` starts the environment as a recorded episode.
+        `reset(options=dataset.reset_options(history_id, episode))` repeats the start of a recorded episode.
 
         Args:
             history_id: a history of the release, whether selected or not.
@@ -277,17 +277,18 @@ class Dataset(Selection):
             if not self.origin.fetch_folder(name).is_dir():
                 raise OptionError(
                     f"{self.root / name}: the checkpoint of history {history_id}'s teammate is missing, because this "
-                    f"release was made without checkpoints; copy it from the release that this one was made from"
+                    f"release was made without checkpoints; copy it from the original release"
                 )
             known["suite"] = str(self.root / TEAMMATES)
         return make_environment(**known | options)
 
     def reset_options(self, history_id: int, episode: int = 0) -> dict[str, np.ndarray]:
-        """Return the options of `reset` that start a recovered environment as a recorded episode.
+        """Return the options of `reset` that make a recovered environment repeat the start of a recorded episode.
 
-        The environment then starts at the recorded state, the teammate repeats its recorded actions, and the recorded
-        recipe follows each delivery. If the ego repeats its recorded actions too, the states, observations and rewards
-        equal the recorded ones without random keys. After the recorded steps, the teammate's policy acts.
+        The environment then starts at the recorded state, the teammate repeats its recorded actions, and each delivery
+        is followed by the recorded recipe. If the ego repeats its recorded actions too, the states, observations and
+        rewards equal the recorded ones; random keys are not needed. After the recorded steps, the teammate's policy
+        acts.
 
         Args:
             history_id: a history of the release, whether selected or not.
@@ -433,7 +434,7 @@ def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | No
 
 
 def teammate_names(dataset: Dataset) -> np.ndarray:
-    """Return a name for each history's teammate, strings (H,); the same policy on the same layout has one name.
+    """Return a name for each history's teammate, strings (H,), equal for the same policy on the same layout.
 
     A name consists of layout and teammate id, or is the task id if the release does not describe the teammate.
     Teammates that take turns within a history share one name.

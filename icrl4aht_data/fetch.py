@@ -231,7 +231,7 @@ def _offline_advice() -> str:
 def _fetch_with_retries(
     client: HubClient | FsspecClient, address: str, name: str, scratch: Path | None, advance: Advance, most: int
 ) -> Path:
-    """Download a file of at most `most` bytes, with retries; the numbers given to `advance` add up to its size."""
+    """Download a file of at most `most` bytes, with retries; the numbers for `advance` add up to the file's size."""
     arrived = 0
 
     def count(size: int) -> None:
@@ -314,7 +314,7 @@ def _open_address(address: str, to: Path | None) -> Remote:
     check_credentials(address)
     client, url = FsspecClient(address), without_credentials(address).rstrip("/")
     base = data_folder() / f"{re.sub(r'[^A-Za-z0-9.]+', '-', url)[:80]}-{disk.short_hash(url.encode(), 8)}"
-    latest = base / "latest"  # file with the name of the version opened last
+    latest = base / "latest"  # contains the folder name of the version opened last
     if offline_switches():
         path = (to or base / (latest.read_text() if latest.is_file() else "none")) / MANIFEST
         if not path.is_file():
@@ -335,7 +335,7 @@ def _open_address(address: str, to: Path | None) -> Remote:
 
 
 def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | None) -> tuple[Path, bytes]:
-    """Download a release's manifest, and return the manifest's path and content; a missing one is an error."""
+    """Download a release's manifest, and return the manifest's path and content; a missing manifest is an error."""
     address = f"{url}/{MANIFEST}"
     try:
         with client.connect():
@@ -354,7 +354,7 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
     """Create the folder for a release's files, and write the manifest into it.
 
     Raises:
-        OptionError: if the folder contains other files, unless it belongs to `system.data_folder` (`is_ours`).
+        OptionError: if the folder contains other files and is not in `system.data_folder` (`is_ours` is False).
     """
     path = folder / MANIFEST
 
@@ -374,7 +374,7 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
 
 @dataclass(frozen=True)
 class DownloadPlan:
-    """Plan of a download: the files of a release to download.
+    """Plan of a download: a release's requested files, and which of the files are absent or changed.
 
     Args:
         root: the remote release.
@@ -410,8 +410,8 @@ def plan_download(
 
     Args:
         url: address of the release.
-        to: folder for the files, which must be absent, empty or contain this release; by default the Hub's cache, or a
-            folder in `system.data_folder`.
+        to: a new or empty folder for the files, or a folder with this release; by default the Hub's cache, or a folder
+            in `system.data_folder`.
         advance: called with the name of a stage, and the bytes compared so far and in total.
         wanted: filters as in `load_icrl4aht`: the plan has the shards with matching histories, their chunk tables, and
             all files that belong to no shard, except the Parquet copy of the episodes.

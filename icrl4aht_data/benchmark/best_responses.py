@@ -82,7 +82,7 @@ class BestResponseCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def chosen_training(trainings: Iterable[TrainedResponse]) -> TrainedResponse:
-    """Return the training run with the highest mean return in the episodes of `choice`."""
+    """Return the training run with the highest `choice`, the mean return in the episodes that decide between runs."""
     return max(trainings, key=lambda one: -math.inf if one.choice is None else one.choice)
 
 
@@ -92,7 +92,7 @@ def best_responses_file() -> Path:
 
 
 def read_best_responses(path: Path | None = None) -> BestResponseCard:
-    """Return the content of a file of best responses, by default of the bundled one.
+    """Return the content of a file of best responses, by default of the bundled file.
 
     Raises:
         OptionError: if the file does not exist or is damaged, or a task has two best responses.

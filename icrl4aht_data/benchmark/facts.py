@@ -190,7 +190,7 @@ def layout_order(layout: str) -> tuple[int, str]:
 
 
 def layout_number(layout: str) -> int:
-    """Return the number from which seeds on a layout (short name) are derived: its position in `LAYOUT_NAMES`.
+    """Return the number of a layout (short name) that seeds depend on: the position of the layout in `LAYOUT_NAMES`.
 
     A registered layout's number is a hash of its name, so the number does not depend on the installed packages.
     """

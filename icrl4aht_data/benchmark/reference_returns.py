@@ -14,7 +14,7 @@ REFERENCES = ("stay", "random", "oracle")
 HEURISTICS = FAMILIES[1:]
 """The teammate families of the test tasks."""
 
-_NO_HEADROOM = 1.0  # a cell has headroom if the return of `oracle` exceeds that of `stay` by more than one point
+_NO_HEADROOM = 1.0  # a cell has headroom if the return of `oracle` exceeds the return of `stay` by more than 1
 
 Cell = tuple[str, str]
 """Pair of a layout's short name and a teammate family."""
@@ -37,18 +37,18 @@ def same_behaviour_tasks() -> list[list[str]]:
 
 
 def has_headroom(references: Mapping[str, float]) -> bool:
-    """Return whether the mean return of `oracle` exceeds that of `stay` by over one point."""
+    """Return whether the mean return of `oracle` exceeds the mean return of `stay` by more than 1."""
     return references["oracle"] - references["stay"] > _NO_HEADROOM
 
 
 def cells_without_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str]) -> list[Cell]:
-    """Return the pairs (layout, family) in which `oracle` earns at most one point more than `stay`."""
+    """Return the pairs (layout, family) for which the mean return of `oracle` exceeds that of `stay` by at most 1."""
     known = [(layout, family) for layout in layouts for family in HEURISTICS if (layout, family) in cells]
     return [cell for cell in known if not has_headroom(cells[cell])]
 
 
 def headroom_table(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str]) -> str:
-    """Return a Markdown table of the returns `stay / random / oracle`, and a line that lists cells without headroom.
+    """Return a Markdown table of mean returns of `stay`, `random` and `oracle`, and a line of cells without headroom.
 
     The table has one row per family and one column per layout; cells with headroom are bold.
     """

@@ -73,12 +73,12 @@ class Task:
 
     @property
     def teammate_key(self) -> tuple[str, str]:
-        """Layout name and hash of the teammate: a key shared by all tasks with the same teammate on the same layout."""
+        """Key that is equal for tasks with the same teammate, layout and recipes: the layout's name and a hash."""
         return self.layout.name, json_hash(self.teammate if self.recipes is None else [self.teammate, self.recipes])
 
     @property
     def teammate_kind(self) -> str:
-        """Value of the index field `teammate_kind`: name of the heuristic or the algorithm."""
+        """Value of the index field `teammate_kind`: name of the heuristic, or of the training algorithm."""
         return self.teammate["family"]
 
     @property
@@ -286,7 +286,7 @@ def check_teammate(teammate: dict[str, Any]) -> None:
         checkpoint = _convert(found.theta, _RlTheta, "teammate.theta: ").checkpoint
         if not is_safe_path(checkpoint):
             raise TaskFormatError(
-                f"teammate.theta.checkpoint: expected a path within the suite, found {checkpoint[:200]!r}"
+                f"teammate.theta.checkpoint: expected a path in the teammate suite, found {checkpoint[:200]!r}"
             )
 
 

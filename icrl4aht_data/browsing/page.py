@@ -66,7 +66,7 @@ class EmbeddedHistory(NamedTuple):
 
 
 def spread_histories(dataset: Dataset, count: int) -> list[int]:
-    """Return at most `count` history ids in ascending order, spread over layouts, kinds of teammates and sources.
+    """Return at most `count` history ids in ascending order, taken in turn from layouts, sources and teammate kinds.
 
     The generated layouts of a family count as one layout.
     """
@@ -164,7 +164,7 @@ def make_browser_page(
     megabytes: float = PAGE_MEGABYTES,
     advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> BrowserPage:
-    """Return an HTML page with all histories of a selection; `spread_histories` can choose fewer histories.
+    """Return an HTML page with all histories of a selection; use `spread_histories` to choose fewer histories.
 
     The page embeds all episodes if it stays below `megabytes`, otherwise evenly spaced episodes of each history,
     including the first and the last. The page says which episodes can be watched.
@@ -211,7 +211,7 @@ def save_browser_page(page: BrowserPage, path: Path) -> None:
 
 def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
     info, origin = dataset.info, dataset.origin
-    name = str(origin) if isinstance(origin, Remote) else dataset.root.resolve().name  # a name without local folders
+    name = str(origin) if isinstance(origin, Remote) else dataset.root.resolve().name  # without the path of the folder
     by_layout = grouped(embedded, lambda one: one.facts["layout"])
     index = {
         "release": {"name": name, "kind": info.kind, "version": info.data_version, "histories": info.histories},
@@ -250,5 +250,5 @@ def page_style() -> str:
 
 
 def page_source(name: str) -> str:
-    """Return the text of one of the files that a page is made of, such as `state.js`."""
+    """Return the text of a source file of the page, such as `state.js`."""
     return (_FILES / name).read_text(encoding="utf-8")

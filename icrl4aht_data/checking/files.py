@@ -110,7 +110,7 @@ def check_references(
 
 
 def check_remote_sizes(remote: Remote, index: Index, shards: list[str], report: Report) -> None:
-    """Check that shards that are not downloaded have the sizes recorded in meta/info.json."""
+    """Check the remote sizes of shards that are not downloaded against the sizes recorded in meta/info.json."""
     try:
         sizes = remote.sizes(name for name in shards if not remote.path(name).exists())
     except Icrl4ahtError as error:

@@ -24,7 +24,7 @@ from icrl4aht_data.utils.files import json_hash, parse_json, read_text, resolve_
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_noun
 
-_ROUNDING = 1e-3  # tolerance for the mean returns that a stream filter records
+_ROUNDING = 1e-3  # tolerance between the mean returns in `Provenance.filter` and in the index
 _NAMED = 100  # maximum number of missing shards to report for one set of numbered shards
 _OF_A_TASK = (
     *("track", "split", "layout", "teammate_family", "teammate_kind", "seed", "source"),
@@ -96,7 +96,7 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
 def _check_disjoint_teammates(tasks: Iterable[Task], report: Report) -> None:
     """Check that training and test tasks of a track have no common teammates."""
     seen: dict[tuple[str, str, str], str] = {}
-    for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # training tasks come first
+    for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # training tasks come before test tasks
         key = (task.track, task.layout.name, json.dumps(task.teammate, sort_keys=True))
         if task.split == "train":
             seen[key] = task.task_id
@@ -123,7 +123,7 @@ def _check_info(index: Index, tasks: list[Task], provenance: ProvenanceByTask | 
 
 
 def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[str, Provenance], report: Report) -> None:
-    """Check the provenance of each task: learners, streams, filter, noise and expert.
+    """Check each task's provenance (learners, environment streams, filter, noise, expert) against index and tasks.
 
     Args:
         index: the release's index.

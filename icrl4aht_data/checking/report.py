@@ -76,11 +76,11 @@ class Report:
         return {finding.file for finding in self.findings}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the report as a JSON object: its fields, `ok`, and `deep` and `quick`, booleans for the level."""
+        """Return the report as a JSON object: its fields, `ok`, and the booleans `deep` and `quick` for the level."""
         return {"ok": self.ok, **asdict(self), "deep": self.level == "deep", "quick": self.level == "quick"}
 
     def add(self, file: str, problem: str) -> None:
-        """Add a finding; after 100,000 findings, add one that says that more were omitted, and drop the rest."""
+        """Add a finding; after 100,000 findings, add a note that problems were omitted, and drop further findings."""
         if len(self.findings) < _FINDINGS:
             self.findings.append(Finding(_printable(file), _printable(problem)))
         elif len(self.findings) == _FINDINGS:

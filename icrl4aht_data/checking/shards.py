@@ -61,7 +61,7 @@ def check_history(
         step_bytes = sum(field.element(layout, info.kind).itemsize for field in entry.stored_fields(info.kind))
         if (size := _COPIES * entry.T * step_bytes) > free_memory():
             raise OptionError(
-                f"checking this history takes {size / 1e9:.3g} GB of memory, more than is free; use a machine with more"
+                f"checking this history takes {size / 1e9:.3g} GB of memory, more than is free; use a larger machine"
             )
         for fault in _history_faults(history, layout, info.environment.kept_steps, deep=report.level == "deep"):
             report.add(entry.shard, f"history {entry.history_id}: {fault}")
@@ -163,7 +163,7 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
     ordered = np.sort(shard.table, order="offset")
     stops, starts = (ordered["offset"] + ordered["size"]).tolist(), ordered["offset"].tolist()
     size = shard.path.stat().st_size
-    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // METADATA_ROW_BYTES  # the most rows that the writer makes
+    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // METADATA_ROW_BYTES  # the writer never makes more rows
     faults, between = [], np.flatnonzero(shard.table["rows"] == 0).tolist()
     if len(ordered) > most or [0, *stops] != [*starts, size]:
         faults, between = [f"the chunk table does not cover the file's {size} bytes, each once"], []

@@ -57,7 +57,7 @@ def all_verbs() -> dict[str, Verb]:
     """Return the `Verb` of every command of this and other installed packages, by the command's name.
 
     Raises:
-        PluginError: if a package's table cannot be imported, or a command already exists.
+        PluginError: if a package's table of commands cannot be imported, or a command already exists.
     """
     plugins, verbs = Plugins(VERB_GROUP, ()), {verb.name: verb for verb in VERBS}
     for package in plugins.names:

@@ -78,7 +78,7 @@ class _OptionField(NamedTuple):
 def dataclass_options(
     kind: type, argument: str, *, exclude: Collection[str] = (), default_text: Mapping[str, str] | None = None
 ) -> Callable[[Command], Command]:
-    """Return a decorator that adds a command-line option for every `Option` field of a dataclass or a nested one.
+    """Return a decorator that adds an option for each `Option` field of a dataclass and of its nested dataclasses.
 
     Args:
         kind: the dataclass. Bool fields become flags, with a `--no-` form if their default is True; tuples become

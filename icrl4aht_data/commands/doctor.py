@@ -71,14 +71,14 @@ def report_lines(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _packages(problems: Problems) -> dict[str, Any]:
-    """Return the version of each required or optional package; for a missing optional one, its install command."""
-    facts: dict[str, Any] = {PACKAGE: _installed(PACKAGE), "folder": str(MINI.parent)}
+    """Return the version of each required or optional package, or how to install a missing optional package."""
+    facts: dict[str, Any] = {PACKAGE: _installed_version(PACKAGE), "folder": str(MINI.parent)}
     if facts[PACKAGE] is None:
         problems[f"{PACKAGE}: not installed"] = f"pip install {PACKAGE}, or -e . in a checkout"
         return facts
     facts["Python"], facts["HDF5"] = platform.python_version(), h5py.version.hdf5_version
     for needed in map(Requirement, requires(PACKAGE) or []):
-        name, found = needed.name, _installed(needed.name)
+        name, found = needed.name, _installed_version(needed.name)
         if name in facts or (needed.marker is not None and name not in EXTRAS):
             continue
         facts[name] = found
@@ -90,7 +90,7 @@ def _packages(problems: Problems) -> dict[str, Any]:
     return facts
 
 
-def _installed(name: str) -> str | None:
+def _installed_version(name: str) -> str | None:
     try:
         return version(name)
     except PackageNotFoundError:

@@ -22,7 +22,7 @@ _IDS_SHOWN = 11  # maximum number of characters of a task's history ids in the t
 
 
 def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
-    """Return a JSON object for each task of `entries`: its names, counts, returns and labels."""
+    """Return a JSON object for each task of `entries`, with names, counts, returns and labels."""
     return [
         {
             "task_id": task_id,

@@ -74,7 +74,7 @@ def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> dict[st
     except Icrl4ahtError:
         raise
     except OSError as error:
-        raise _write_error(folder.parent, size, error) from error
+        raise _cache_error(folder.parent, size, error) from error
 
 
 def new_mapped_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.memmap:
@@ -132,7 +132,7 @@ def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> dict[s
     raise CacheError(f"{folder}: arrays just written cannot be read: check the disk")
 
 
-def _write_error(folder: Path, size: int, error: OSError) -> CacheError:
+def _cache_error(folder: Path, size: int, error: OSError) -> CacheError:
     """Return a `CacheError` for a failed write to the cache folder."""
     if error.errno in NO_ROOM:
         room = describe_disk(folder)

@@ -47,7 +47,7 @@ def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict
 
 
 def expert_folder(sha256: str) -> str:
-    """Return the path in a release of an expert's checkpoint folder, named by the SHA-256 of the expert's weights."""
+    """Return the path of an expert's checkpoint folder in a release, given the SHA-256 of the expert's weights."""
     return f"{EXPERTS}/{sha256}"
 
 

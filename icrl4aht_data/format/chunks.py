@@ -58,7 +58,7 @@ def read_table(path: Path) -> np.ndarray:
     if table.dtype != CHUNK_DTYPE or table.ndim != 1:
         raise ChunkTableError(f"{path}: expected rows of {CHUNK_DTYPE}, found {table.dtype} of shape {table.shape}")
     if (table["size"] > _ROW_BYTES).any():
-        raise ChunkTableError(f"{path}: expected chunks of at most {_ROW_BYTES:,} bytes, found a larger one")
+        raise ChunkTableError(f"{path}: expected chunks of at most {_ROW_BYTES:,} bytes, found a larger chunk")
     return table
 
 

@@ -87,7 +87,7 @@ class Columns:
         values: dict[str, Any] = {name: self._arrays[name][row].item() for name in _NUMBERS}
         values |= {name: self._values[name][self._arrays[name][row]] for name in _STRINGS}
         for name, absent in _ABSENT.items():
-            if values[name] == absent or values[name] != values[name]:  # the second test finds NaN
+            if values[name] == absent or values[name] != values[name]:  # only NaN differs from itself
                 values[name] = None
             elif name in ENCODED:
                 values[name] = msgspec.json.decode(values[name], type=ENTRY_HINTS[name])
@@ -100,7 +100,7 @@ def read_columns(path: Path) -> Columns:
     Raises:
         IndexFormatError: if a line is malformed; the message has the file and the line number.
     """
-    # The default of these dictionaries gives each new value the next code.
+    # A `defaultdict` gives each new value of a column the next code.
     codes = {name: defaultdict[str, int](count().__next__) for name in _STRINGS}
     parts: dict[str, list[np.ndarray]] = {name: [] for name in (*_NUMBERS, *_STRINGS)}
     entries = _entries(path)

@@ -39,7 +39,7 @@ _SEMVER = re.compile(
     rf"{_NUMBER}\.{_NUMBER}\.{_NUMBER}(-{_PRERELEASE}(\.{_PRERELEASE})*)?(\+[0-9A-Za-z-]+(\.[0-9A-Za-z-]+)*)?", re.ASCII
 )
 
-_VERSION_LENGTH = 100  # maximum number of characters
+_VERSION_LENGTH = 100  # maximum number of characters of a version
 
 _Steps = Annotated[int, Meta(gt=0, lt=2**31)]
 _Bytes = Annotated[int, Meta(ge=0, lt=2**62)]
@@ -50,7 +50,7 @@ class EpisodeLengths(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Args:
         max_steps: number of steps of an episode while the ego learns.
-        kept_steps: number of first steps of each episode that the histories contain.
+        kept_steps: number of steps at the start of each episode that the histories contain.
     """
 
     max_steps: _Steps
@@ -209,7 +209,7 @@ def read_info(root: Path) -> ReleaseInfo:
     path = resolve_inside(root, INFO)
     if not path.is_file():
         raise RootNotFoundError(
-            f"{root}: no release here, expected {INFO} in it; give the folder of a release, fetch one with "
+            f"{root}: no release here, expected the file {INFO}; give the folder of a release, fetch one with "
             f"`icrl4aht-data download`, or give no folder for the bundled release"
         )
     try:

@@ -98,7 +98,7 @@ def read_tasks_and_layouts(path: Path) -> list[Task]:
 
 
 def write_layouts_file(path: Path, layouts: Iterable[Layout]) -> None:
-    """Write a file with those layouts that are not in the benchmark; write no file if all of them are.
+    """Write a file with those layouts that are not in the benchmark; write no file if all layouts are in the benchmark.
 
     Raises:
         OptionError: if a recipe of a layout cannot be delivered, since readers would reject such a layout.

@@ -53,7 +53,7 @@ def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
     if not text.endswith("\n"):
         raise IndexFormatError(f"{path} is cut off: the last line does not end with a newline; download it again")
     listed: dict[str, str] = {}
-    folded: dict[str, str] = {}  # names by lower-case name, to find names that are equal on disks that ignore case
+    folded: dict[str, str] = {}  # lower-case name -> name, to find names that differ only in case
     for number, line in enumerate(text.splitlines(), start=1):
         match = _LINE.fullmatch(line)
         if match is None:

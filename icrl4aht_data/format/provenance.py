@@ -25,7 +25,7 @@ LabelView = Literal["ego", "state"]
 
 
 class StreamReturns(Struct, frozen=True, omit_defaults=True):
-    """Mean returns of a set of environment streams.
+    """Mean returns of streams; a stream is all recorded episodes of one parallel environment of a learner.
 
     Args:
         streams: number of streams.
@@ -81,8 +81,8 @@ class TeammateSwaps(Struct, frozen=True, omit_defaults=True):
 
     Args:
         every: number of episodes after which the next teammate plays.
-        teammates: entries of the teammates, as in `Task.teammate`, in order of play. The first one is the task's
-            teammate; after the last one, the first one plays again.
+        teammates: entries of the teammates, as in `Task.teammate`, in order of play. The first entry is the task's
+            teammate, which plays again after the last entry's teammate.
     """
 
     every: _Positive
@@ -93,7 +93,7 @@ class TeammateSwaps(Struct, frozen=True, omit_defaults=True):
         return self.teammates[episode // self.every % len(self.teammates)]
 
     def spans(self, episodes: int) -> tuple[tuple[int, str], ...]:
-        """Return the value of `Entry.teammate_of_episode` for a history with the given number of episodes."""
+        """Return pairs (first episode, teammate id) for a number of episodes, see `Entry.teammate_of_episode`."""
         return tuple((first, teammate_id(self.teammate(first))) for first in range(0, episodes, self.every))
 
 
@@ -229,7 +229,7 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
         return [task, *(replace(task, teammate=one) for one in (self.swaps.teammates[1:] if self.swaps else ()))]
 
     def is_oracle_useful(self, return_end: float) -> bool:
-        """Return whether the oracle is a useful expert, that is, earns at least the return at the histories' end.
+        """Return whether the oracle is a useful expert, that is, earns at least `return_end`.
 
         Args:
             return_end: mean return of the last episodes of the task's histories, see `schema.curve_ends`.
@@ -293,7 +293,7 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class _EgoScale(Struct):
-    """Hyper-parameters of the ego that this package reads; other hyper-parameters are not checked."""
+    """The ego's hyper-parameters that this package reads; other hyper-parameters are not checked."""
 
     total_steps: int
     environments: int

@@ -24,8 +24,8 @@ h5d, h5l, h5t, h5z = _low.h5d, _low.h5l, _low.h5t, _low.h5z
 
 SHUFFLE, DEFLATE = h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE
 
-_SUPERBLOCKS = tuple(b"\x89HDF\r\n\x1a\n" + bytes([version, 8, 8]) for version in (2, 3))  # 8-byte addresses
-_LOCAL_HEAP = re.compile(rb"HEAP\0.{8}\0{3}", re.DOTALL)  # libhdf5 rejects sizes of a terabyte or more
+_SUPERBLOCKS = tuple(b"\x89HDF\r\n\x1a\n" + bytes([version, 8, 8]) for version in (2, 3))  # 8-byte offsets and lengths
+_LOCAL_HEAP = re.compile(rb"HEAP\0.{8}\0{3}", re.DOTALL)  # libhdf5 rejects heaps of a terabyte or more
 
 _CHUNK_BYTES = 256 * 2**20
 _ELEMENT_BYTES = 2**16

@@ -112,7 +112,7 @@ class Field:
         return np.dtype(("u1", (record_size(layout),) if self.row == "state" else layout.obs_shape))
 
     def memory_dtype(self, layout: Layout) -> np.dtype:
-        """Return the dtype in which samplers keep an element in memory: the compact one for every kind of release."""
+        """Return the dtype of an element in the memory of samplers: as in a `lite` shard, for every kind of release."""
         return self.element(layout, "lite")
 
 

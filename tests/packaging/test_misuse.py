@@ -76,8 +76,8 @@ train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 """
 
 FAILED = """
-list none | none: no release here, expected meta/info.json in it; give the folder of a release
-list empty | empty: no release here, expected meta/info.json in it; give the folder of a release
+list none | none: no release here, expected the file meta/info.json; give the folder of a release
+list empty | empty: no release here, expected the file meta/info.json; give the folder of a release
 verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
 list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
 convert {MINI} --out file/x --to lite | file: File exists; expected a folder, found a file

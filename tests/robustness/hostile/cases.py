@@ -381,7 +381,7 @@ add_hashed_cases(
     "chunk table|expected rows of", {f"table: {name}": replace_file(TABLE, make) for name, make in _TABLES.items()}
 )
 add_hashed_cases(
-    "found a larger one", {"table: huge chunks": change_table(lambda rows: rows["size"].__setitem__(0, 2**32 - 1))}
+    "found a larger chunk", {"table: huge chunks": change_table(lambda rows: rows["size"].__setitem__(0, 2**32 - 1))}
 )
 add_hashed_cases(
     "cover|crc32", {"table: one offset": change_table(lambda rows: rows["offset"].__setitem__(slice(None), 0))}
