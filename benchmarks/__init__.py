@@ -1,1 +1,1 @@
-"""Benchmark commands, which print JSON lines; both programs of a comparison are measured in the same run."""
+"""Benchmark commands, which print JSON lines and measure compared programs in the same run."""

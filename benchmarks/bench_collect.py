@@ -51,7 +51,7 @@ class _StopCollectionError(Exception):
 
 
 def collect_updates(profile: Profile, updates: int, save_seconds: float) -> dict[str, float]:
-    """Collect the profile's last heuristic task, but stop after `updates` updates. Return the timing."""
+    """Collect the profile's last task with a heuristic teammate for `updates` updates, and return the timing."""
     work = _last_heuristic_work(profile)
 
     def report(done: int, speed: float) -> None:
@@ -111,7 +111,7 @@ def collection_memory(updates: int) -> dict[str, Any]:
 def measure_peak_memory(updates: int, recording: bool) -> float:
     """Return this process's peak memory in MiB after learning, or after collecting and saving at every update."""
     profile = load_profile("paper")
-    # The number of environments and the rollout length, not the network, determine the memory: a small network is fast.
+    # A small network saves time; the memory depends on the number of environments and the rollout length.
     profile = replace(profile, ego=replace(profile.ego, widths=Widths((4,), (4,), 8, 8, 8)))
     if recording:
         collect_updates(profile, updates, save_seconds=0)
@@ -159,7 +159,7 @@ PARTS_OF_COLLECTION = ("speed", "noise", "memory", "bytes")
 def main(parts: tuple[str, ...], profile: str, updates: int, layout: str, wide_updates: int, streams: int) -> None:
     """Measure speed, memory and bytes of a collection, and print a JSON line for each part.
 
-    An update of the part `memory` has 262,144 environment steps.
+    In the part `memory`, an update has 262,144 environment steps.
     """
     measures: dict[str, Callable[[], dict[str, Any]]] = {
         "speed": lambda: collection_speed(profile, updates),

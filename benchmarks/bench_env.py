@@ -108,9 +108,9 @@ def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
 
 
 def print_layouts(n: int, rounds: int) -> None:
-    """Print the speed of n environments on n generated layouts, on one layout, and of JaxMARL on that layout.
+    """Print the speed of n environments on n generated layouts and on one layout, and of JaxMARL on this layout.
 
-    Observations have the canonical channels, which are more than the channels of the one layout.
+    Our observations have the canonical channels, which are more than the channels of this layout.
     """
     one = get_layout(_ONE)
     many = generate_layouts("templates", 0, n // 2) + generate_layouts("rooms", 0, n - n // 2)

@@ -14,7 +14,7 @@ untrained.
 `benchmarks.harness.product_flops`, divided by the speed of the large product with the same dtype. The encoder `words`
 computes equal observations of a batch once, but its operations are counted as if all observations differed.
 `program_gib` is the memory that the compiler planned for a program, `process_peak_gib` the process's peak memory since
-the first case, and `accumulate` the number of parts that a batch is divided into to fit into memory.
+the first case, and `accumulate` the number of parts into which a batch is divided, so that it fits into memory.
 """
 
 from __future__ import annotations
@@ -187,16 +187,16 @@ def measure_training(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) 
     parts, reason = 1, ""
     while sizes.batch % parts == 0:
         try:
-            return _training_steps(sizes, size, encoder, dtype, parts)
+            return _measure_training_steps(sizes, size, encoder, dtype, parts)
         except (jax.errors.JaxRuntimeError, MemoryError) as error:
             if not isinstance(error, MemoryError) and _OUT_OF_MEMORY not in str(error):
                 raise
             reason = str(error)
         parts *= 2  # outside the except block, which keeps the arrays of the failed attempt in memory
-    raise MemoryError(f"the batch does not fit into memory, however many parts it has: {reason}")
+    raise MemoryError(f"the batch does not fit into memory, even if divided into more parts: {reason}")
 
 
-def _training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, parts: int) -> dict[str, Any]:
+def _measure_training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, parts: int) -> dict[str, Any]:
     length = context_length(sizes, size)
     dataset = load_icrl4aht(split="train", source="ppo", layout=_LAYOUT, obs="state")
     options = TrainOptions(batch_size=sizes.batch, context=length, accumulate=parts)
@@ -208,7 +208,7 @@ def _training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, p
         program = compile_measured(trainer.step, state, batch)
         limit = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", program.bytes)
         if program.bytes > limit:
-            raise MemoryError(f"needs {gib(program.bytes)} GiB in {parts} parts, expected at most {gib(limit)}")
+            raise MemoryError(f"a batch in {parts} parts needs {gib(program.bytes)} GiB, expected at most {gib(limit)}")
 
         def step(take: Callable[[], Any]) -> Any:
             nonlocal state
@@ -250,7 +250,7 @@ def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) ->
     compile_seconds = time.perf_counter() - started
     episodes = play_episodes(prepared)
     filling, shortest = -(-context // sizes.episode_steps), 2 * -(-context // 5 // sizes.episode_steps)
-    for _ in islice(episodes, filling):  # fills the windows; full windows drop a fifth of their steps
+    for _ in islice(episodes, filling):  # fill the windows; a full window drops a fifth of its steps
         pass
     seconds = seconds_of_calls(partial(next, episodes), sizes.seconds, least=max(3, shortest))
     streams, episode_seconds = len(tasks) * seeds, statistics.mean(seconds)
@@ -276,7 +276,7 @@ def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
 
 
 def context_length(sizes: Sizes, size: str) -> int:
-    """Return AD's window length, which is L in training and K in acting, for the name of a model size."""
+    """Return AD's window length for a named model size: L in training, K in acting."""
     return min(sizes.length, SIZES[size].train["context"])
 
 
@@ -333,8 +333,8 @@ def stop_at_limit(pending: Sequence[str]) -> None:
 @click.option("--seconds", type=float, help="Least time of a measurement.  [default: 4, or 0.05 for tiny sizes]")
 def main(parts: tuple[str, ...], cases: tuple[str, ...], minutes: float, small: bool, seconds: float | None) -> None:
     """Measure the speed of learning, training and evaluation on a GPU, and print a JSON line for each case."""
-    if "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:  # JAX accepts only one of the two names
-        os.environ.setdefault("XLA_CLIENT_MEM_FRACTION", "0.92")  # of the GPU's memory; the default is less
+    if "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:  # JAX accepts only one of the two variables
+        os.environ.setdefault("XLA_CLIENT_MEM_FRACTION", "0.92")  # share of the GPU's memory; the default is less
     pending = [name for name in CASES if (name in cases if cases else name.split("/")[0] in parts)]
     limit = Timer(60 * minutes, stop_at_limit, [pending])
     limit.daemon = True  # so that an interrupted command ends at once

@@ -116,9 +116,9 @@ def compare_jaxmarl(script: Path, layout: Layout, environments: int, rounds: int
 
 
 def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
-    """Yield the windows of a sampler as batches that are read as in the published code.
+    """Yield batches of a sampler's windows, which are read from `folder` in the way of the published code.
 
-    The step before a window has zeros instead of its values, since speed does not depend on them.
+    The action and the reward before a window are zeros, since speed does not depend on these values.
     """
     number = {int(history): k for k, history in enumerate(sampler.dataset.ids)}
     read, i = published_reader(folder, sampler.length), 0
@@ -139,7 +139,7 @@ def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
 
 
 def ad_method(size: str, layouts: Sequence[Layout], view: BatchView | None = None, **changes: Any) -> Method:
-    """Return the method AD of a model size on some layouts; `changes` replace options of the size."""
+    """Return the method AD with a named model size for some layouts; `changes` replace options of the size."""
     model = ModelOptions(**SIZES[size].model | changes)
     return get_method("ad")(model, overcooked_world(layouts, model.encoder, view))
 
@@ -210,7 +210,7 @@ def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int
 
 
 def evaluate_all_tasks(size: str, protocol: Protocol) -> None:
-    """Print the minutes to evaluate all test tasks with an untrained AD model per layout, including compilation."""
+    """Print the minutes to compile and evaluate all test tasks, with one untrained AD model for each layout."""
     tasks = [task for track in TRACKS for task in published_tasks(track)]
     seconds = elapsed(lambda: evaluate("AD", lambda layout: untrained_ad(layout, size, "cached"), tasks, protocol))
     _print(part="tasks", size=size, tasks=len(tasks), episodes=protocol.episodes, minutes=round(seconds / 60, 2))

@@ -8,7 +8,7 @@ All readers make the same windows of the same histories, which are bundled histo
     ours        reads state records, or uint8 or float32 observations, with each cache (ram, mmap, and stream with and
                 without decoded chunks in memory), into reused batch buffers
 
-Readers take turns in rounds. One JSON line is printed for each of our readers and each peer, with the ratio of both and
+Readers take turns in rounds. One JSON line is printed for each of our readers and each peer, with their ratio and
 our target ratio to the reader `published`.
 """
 
@@ -51,7 +51,7 @@ ReadWindows = Callable[[np.ndarray, np.ndarray], dict[str, np.ndarray]]
 
 
 def published_reader(folder: Path, length: int) -> ReadWindows:
-    """Return a reader like that of the published code: it reads neighbouring windows as one slice, and splits it."""
+    """Return a reader like the published code's: overlapping or adjacent windows are read as one slice, then split."""
     file = h5py.File(folder / HISTORIES_H5, "r", rdcc_nbytes=512 * 2**20)
 
     def read(ids: np.ndarray, starts: np.ndarray) -> dict[str, np.ndarray]:
@@ -77,9 +77,9 @@ def published_reader(folder: Path, length: int) -> ReadWindows:
 
 
 def fair_reader(folder: Path, length: int, batch: int) -> ReadWindows:
-    """Return a reader that is a fair peer of our loader: it uses h5py in a way that suits random windows.
+    """Return a reader that uses h5py in a way that suits random windows, for a fair comparison with our loader.
 
-    Unlike the published reader, it reads files with chunks as long as a window, and fills one reused buffer.
+    Unlike the published reader, it reads each window directly into a reused buffer, from files with shorter chunks.
     """
     file = h5py.File(folder / HISTORIES_H5, "r")
     first: Any = {name: file[f"/0/{name}"] for name in _READ}
@@ -96,7 +96,7 @@ def fair_reader(folder: Path, length: int, batch: int) -> ReadWindows:
 
 
 def make_data(folder: Path, layout: str, histories: int) -> None:
-    """Write the histories as files for our readers, the published reader and the fair reader, unless they exist."""
+    """Write the data of all three readers, if not yet done: a release for our loader, files for both others."""
     if (folder / "done").exists():
         return
     shutil.rmtree(folder, ignore_errors=True)
@@ -112,7 +112,7 @@ def make_data(folder: Path, layout: str, histories: int) -> None:
 
 
 def rotated_histories(source: Dataset, count: int) -> Iterator[NewHistory]:
-    """Yield `count` histories: those of a selection in turn, rotated by one more episode in each round."""
+    """Yield `count` histories by cycling through `source`, rotated by one more episode in each cycle."""
     kept = source.info.environment.kept_steps
     for number in range(count):
         history, episodes = source[number % len(source)], number // len(source)

@@ -100,9 +100,9 @@ def compile_measured(function: Any, *arguments: Any, **options: Any) -> Measured
 def product_flops(program: Any) -> float:
     """Return the number of floating-point operations in a program's matrix products, 2 * M * N * K for each.
 
-    The rounds of a loop are all counted if their number is known (`scan`, `lax.map`), otherwise only one. In a
-    condition, only the most expensive branch is counted. Other operations, such as softmax and the optimizer, are not
-    counted. Recomputation is counted only if the program requests it (`jax.checkpoint`).
+    All iterations of a loop are counted if their number is known (`scan`, `lax.map`), otherwise one iteration. In a
+    conditional, only the most expensive branch is counted. Other operations, such as softmax and the optimizer, are
+    not counted. Recomputation is counted only if the program requests it (`jax.checkpoint`).
 
     Args:
         program: a jaxpr, closed or not, such as `jax.jit(f).trace(..).jaxpr`.

@@ -45,7 +45,7 @@ def jaxmarl_environment(layout: Layout) -> OvercookedV2:
 def jaxmarl_training(script: Path, env: MultiAgentEnv, config: PPOConfig, updates: int) -> Callable[[], Any]:
     """Return a compiled function that trains JaxMARL's IPPO from the start and waits for the result.
 
-    The result is that of the script's function `train`.
+    A call of the function returns the result of the script's function `train`.
 
     Args:
         script: path of a copy of JaxMARL's script.
@@ -85,7 +85,7 @@ def jaxmarl_training(script: Path, env: MultiAgentEnv, config: PPOConfig, update
 
 
 def _load_script(path: Path) -> dict[str, Any]:
-    """Run our copy of JaxMARL's training script, and return the names that the script defines."""
+    """Run a copy of JaxMARL's training script, and return the names that the script defines."""
     if path.suffix != ".py":
         raise click.UsageError(f"{path}: not a Python file, expected a copy of JaxMARL's script")
     silent: Any = ModuleType("silent")

@@ -37,7 +37,7 @@ EARNED = {"stay": (0.0, 0.0), "search": (-20.0, 40.0), "oracle": (40.0, 40.0)}
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
-    """Return a release of random play with histories of the sources `search` and `ppo`."""
+    """Return a release of random play whose histories name `search` and `ppo` as their sources."""
     root = tmp_path_factory.mktemp("demo") / "release"
     random_release(root, layouts=("demo_wide",), streams=2, length=100, sources=("search", "ppo"))
     return root
@@ -79,7 +79,7 @@ def test_conclusion_says_whether_memory_raises_the_return(last, last_cleared, ve
 
 @pytest.mark.slow
 def test_demo_prints_every_step_and_writes_all_files(release, tmp_path, monkeypatch, capsys):
-    """The model is really trained, but results of its evaluation are invented."""
+    """The model is trained, but the results of its evaluation are invented."""
     monkeypatch.setattr(results, "evaluate", fake_evaluate(20.0, 0.0))
     monkeypatch.setattr(demo, "DEMO_LAYOUT", "demo_wide")
     page = demo.run_demo(tmp_path, replace(SETTINGS, root=release))
@@ -96,7 +96,7 @@ def test_demo_prints_every_step_and_writes_all_files(release, tmp_path, monkeypa
 
 @pytest.mark.slow
 def test_complete_demo_on_the_bundled_release_shows_plausible_returns(tmp_path, monkeypatch, capsys):
-    """Other tests verify the bundled release; half of the tasks and one seed are enough for rough bounds."""
+    """Run the demo with quick verification, half of the tasks and one seed, which are enough for rough bounds."""
     monkeypatch.setattr(demo, "verify_release", lambda root, level: verify_release(root, level="quick"))
     few = [task for task in bundled_tasks("preference", "validation") if task.layout.name == demo.DEMO_LAYOUT][::2]
     monkeypatch.setattr(demo, "bundled_tasks", lambda track, split: few)

@@ -1,4 +1,4 @@
-"""Test `research proof`, which trains models on a release: its jobs, stored returns, and table in the dataset card."""
+"""Test `research proof`, which trains models on a release: jobs, stored returns, and the table in the dataset card."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_proof_table_has_mean_and_range_over_finished_training_runs(release, tmp
     assert " | ".join(["| all | AD, expert labels | 2", *spreads]) in proof_table(content)
 
 
-def test_card_shows_the_proof_only_of_its_own_release(release, tmp_path, monkeypatch):
+def test_dataset_card_shows_only_results_of_models_trained_on_its_release(release, tmp_path, monkeypatch):
     content = {
         "histories_sha256": file_hash(release / HISTORIES),
         "training": {"steps": 800, "batch_size": 16, "context": 500},

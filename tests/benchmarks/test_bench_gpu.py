@@ -96,18 +96,18 @@ def test_error_of_a_case_is_reported_and_the_other_cases_are_measured(monkeypatc
 def test_batch_that_does_not_fit_in_memory_is_split(monkeypatch):
     tried = []
 
-    def fake_training_steps(sizes, size, encoder, dtype, parts):
+    def fake_measure(sizes, size, encoder, dtype, parts):
         tried.append(parts)
         if parts < 4:
             raise (MemoryError("96 GiB"), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: .."))[parts - 1]
         return {"accumulate": parts}
 
-    monkeypatch.setattr(bench_gpu, "_training_steps", fake_training_steps)
+    monkeypatch.setattr(bench_gpu, "_measure_training_steps", fake_measure)
     measure = partial(measure_training, size="small", encoder="paper", dtype="float32")
     assert measure(FULL_SIZES) == {"accumulate": 4}
     assert tried == [1, 2, 4]
     with pytest.raises(
-        MemoryError, match="the batch does not fit into memory, however many parts it has: RESOURCE_EXHAUSTED"
+        MemoryError, match="the batch does not fit into memory, even if divided into more parts: RESOURCE_EXHAUSTED"
     ):
         measure(SMALL_SIZES)  # a batch of 2 rows has at most 2 parts
 

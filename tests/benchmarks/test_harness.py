@@ -1,4 +1,4 @@
-"""Test counting the floating-point operations of matrix products in a program."""
+"""Test `product_flops`, which counts the floating-point operations of a program's matrix products."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_backward_pass_has_two_matrix_products_for_each_forward_product():
     assert count_flops(jax.grad(loss, (0, 1)), (3, 5), (5, 7)) == 3 * 2 * 3 * 5 * 7
 
 
-def test_loops_count_every_round_and_conditions_count_the_costliest_branch():
+def test_all_iterations_of_a_loop_and_the_costliest_branch_are_counted():
     def loop(x, kernel):
         return jax.lax.scan(lambda x, _: (x @ kernel, None), x, length=11)[0]
 

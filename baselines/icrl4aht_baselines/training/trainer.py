@@ -107,14 +107,14 @@ class Trainer:
         share = len(devices) * options.accumulate
         if options.batch_size % share:
             raise OptionError(
-                f"batch_size = {options.batch_size}: expected a multiple of {share}, {len(devices)} devices x "
-                f"{options.accumulate} parts"
+                f"batch_size = {options.batch_size}: expected a multiple of {share}, the number of devices "
+                f"({len(devices)}) x accumulate ({options.accumulate})"
             )
         self.method, self.options, self._optimizer = method, options, training_optimizer(options)
         self._learning_rate = learning_rate_schedule(options)
         mesh = Mesh(np.asarray(devices), (BATCH_AXIS,))
         # Data parallelism: each device has the complete state and a share of the rows.
-        # XLA averages the gradients over devices, because the sharding of the result requires equal states.
+        # XLA averages the gradients over devices, because the result is declared to be the same on every device.
         self.rows, self._parts, self.everywhere = (
             NamedSharding(mesh, PartitionSpec(*axes)) for axes in ((BATCH_AXIS,), (None, BATCH_AXIS), ())
         )
@@ -166,14 +166,14 @@ class Trainer:
             return gradient, log
 
         def split_rows(rows: Array) -> Array:
-            """Split rows (B, ..) into interleaved parts (parts, B / parts, ..): each part has rows on every device."""
+            """Split rows (B, ..) into interleaved micro-batches (parts, B / parts, ..) with rows on every device."""
             rows = rows.reshape(-1, parts, *rows.shape[1:]).swapaxes(0, 1)
             return jax.lax.with_sharding_constraint(rows, self._parts)
 
         if parts == 1:
             return part_gradient(jnp.int32(0), batch)
-        # A scan stores the activations of one part at a time.
-        # All rows have equal weight in the loss, so the mean of the parts' gradients is the gradient of the batch.
+        # A scan stores the activations of one micro-batch at a time.
+        # All rows have equal weight in the loss, so the mean gradient of micro-batches is the gradient of the batch.
         split = jax.tree.map(split_rows, batch)
         first = jax.tree.map(lambda leaf: leaf[0], split)
         shapes = jax.eval_shape(part_gradient, jnp.int32(0), first)
@@ -271,7 +271,7 @@ class TrainingTask(NamedTuple):
             log = stack.enter_context(closing(RunLog(folder, lambda line: line["step"] <= first)))
             loggers = stack.enter_context(open_loggers(log_to if writes else (), folder / METRICS, config))
             batches = stack.enter_context(trainer.batches(self.data.train, first, options.steps))
-            stop = stack.enter_context(stop_signals())  # last, so that a signal during setup ends the process
+            stop = stack.enter_context(stop_signals())  # installed last, so that a signal during setup ends the process
             before = first, time.perf_counter(), 0.0
             save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * SAVE_MINUTES)
             loss: float | None = None

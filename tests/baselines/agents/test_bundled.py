@@ -63,7 +63,7 @@ def test_bundled_model_keeps_parameters_and_training_record_of_its_run(trained_r
         assert copied.size == drawn.size and copied.mode == "P"
 
 
-def test_model_bundled_as_sampled_samples_its_actions_by_default(trained_run, tmp_path, monkeypatch):
+def test_model_bundled_with_sampled_actions_samples_by_default(trained_run, tmp_path, monkeypatch):
     bundle_run(trained_run, "ad-drawn", "teammate", tmp_path, sampled=True)
     monkeypatch.setattr(bundled.bundled_models, "__defaults__", (tmp_path,))
     by_default, greedy = find_agent("ad-drawn"), find_agent("ad-drawn", greedy=True)

@@ -105,8 +105,8 @@ def test_host_agents_receive_canonical_channels():
         from_host(agent, "union")  # type: ignore[arg-type]
 
 
-def test_state_records_of_each_batch_are_observed_on_their_own_layouts(lite):
-    """Validation data contains only the second layout, but numbers layouts in the same way as training data."""
+def test_layout_numbers_of_a_batch_determine_the_layouts_of_observations(lite):
+    """Validation data contains only the second layout, which has the same number as in training data."""
     job = prepare("ad", MODEL, dataclasses.replace(OPTIONS, batch_size=8), HistoryOptions(("all",), str(lite[0])))
     names = job.about["histories"]["layouts"]
     view = CompactView("paper", tuple(map(get_layout, names)), canonical=True)

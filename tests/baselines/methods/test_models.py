@@ -163,7 +163,7 @@ def test_causal_attention_equals_attention_with_a_mask(monkeypatch):
     def masked_attention(q, k, v):
         return jax.nn.dot_product_attention(q, k, v, mask=jnp.asarray(query_mask(7))[None, None])
 
-    def causal_attention_in_parts(q, k, v):
+    def context_and_query_attention(q, k, v):
         context = attention.causal_attention(q[:, :7], k[:, :7], v[:, :7])
         queries = attention.causal_attention(q[:, 7:], k[:, :7], v[:, :7], k[:, 7:], v[:, 7:])
         return jnp.concatenate([context, queries], axis=1)
@@ -177,7 +177,7 @@ def test_causal_attention_equals_attention_with_a_mask(monkeypatch):
         monkeypatch.setattr(attention, "LONG_ROWS", long)
         jax.tree.map(
             partial(np.testing.assert_allclose, rtol=2e-5, atol=5e-6),
-            value_and_gradients(causal_attention_in_parts),
+            value_and_gradients(context_and_query_attention),
             expected,
         )
 

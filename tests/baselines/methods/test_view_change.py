@@ -115,7 +115,7 @@ def test_mirrored_batches_have_mirrored_actions():
     mirroring, number = np.divmod(mirrored.layouts, len(layouts))
     np.testing.assert_array_equal(number, plain.layouts)
     assert set(mirroring) == {0, 1, 2, 3}
-    np.testing.assert_array_equal(mirrored.obs, plain.obs)  # the view mirrors state records later
+    np.testing.assert_array_equal(mirrored.obs, plain.obs)  # the view mirrors observations, not state records
     view = ViewChange(*(jnp.asarray(flag)[:, None] for flag in (mirroring < 0, mirroring % 2 > 0, mirroring > 1)))
     np.testing.assert_array_equal(mirrored.target_actions, view.actions(plain.target_actions.astype(np.int32)))
     assert mirrored.target_actions.dtype == plain.target_actions.dtype

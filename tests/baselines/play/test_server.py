@@ -47,7 +47,7 @@ def new_session(
 
 
 class Browser:
-    """A connection to the server that sends messages and stores the last received state."""
+    """A browser's connection to the server: it sends messages and stores the last received state."""
 
     def __init__(self, socket: Any) -> None:
         self.socket, self.setup = socket, socket.receive_json()

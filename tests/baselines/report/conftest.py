@@ -13,7 +13,7 @@ from tests.helpers.evaluated import write_invented_responses
 
 
 @pytest.fixture(scope="session")
-def response_files(tmp_path_factory) -> Path:
+def responses_folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("cards")
     write_invented_responses(folder / "measured.json")
     write_best_responses(folder / "none.json", BestResponseCard("0", "seeded", "None measured."))
@@ -21,14 +21,14 @@ def response_files(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def empty_responses(response_files) -> Iterator[None]:
+def empty_responses(responses_folder) -> Iterator[None]:
     """Replace the package's best responses with an empty set."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(best_responses, "best_responses_file", lambda: response_files / "none.json")
+        patch.setattr(best_responses, "best_responses_file", lambda: responses_folder / "none.json")
         yield
 
 
 @pytest.fixture
-def invented_responses(empty_responses, response_files, monkeypatch) -> None:
+def invented_responses(empty_responses, responses_folder, monkeypatch) -> None:
     """Replace the package's best responses with the invented ones that `write_invented_responses` writes."""
-    monkeypatch.setattr(best_responses, "best_responses_file", lambda: response_files / "measured.json")
+    monkeypatch.setattr(best_responses, "best_responses_file", lambda: responses_folder / "measured.json")

@@ -107,7 +107,7 @@ def test_mean_best_return_uses_stay_for_families_without_best_response(invented_
     )
 
 
-def test_results_page_is_written_with_and_without_best_responses(stored, tmp_path, response_files, monkeypatch):
+def test_results_page_is_written_with_and_without_best_responses(stored, tmp_path, responses_folder, monkeypatch):
     old = stored.agents | {"low": AgentFacts("an old one", "noise", "oracle", commit="71f723c")}
     some = dataclasses.replace(stored, agents=old)
     paths = comparison.write_comparison(some, tmp_path / "page")
@@ -117,7 +117,7 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
     assert "These models were trained with earlier code: `low`." in text and "None measured (version" in text
     assert paths[1].stat().st_size > 10_000
     assert len(pd.read_parquet(paths[3])) == len(stored.table)
-    monkeypatch.setattr(best_responses, "best_responses_file", lambda: response_files / "measured.json")
+    monkeypatch.setattr(best_responses, "best_responses_file", lambda: responses_folder / "measured.json")
     table = add_scales(stored.table)
     down = table[table["layout"] == "cramped_down"]
     assert len(table) == len(stored.table) and set((down["best"] - down["stay"]).dropna()) == {20}

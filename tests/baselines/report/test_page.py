@@ -90,7 +90,7 @@ def test_html_in_names_is_escaped_in_all_reports(tmp_path):
     assert "<br>episodes 1: 10.0, " in text, "line breaks in table cells are not escaped"
 
 
-def test_html_report_states_conditions_once_and_marks_overlaps(tmp_path):
+def test_html_report_shows_conditions_once_and_flags_overlaps(tmp_path):
     record = [{"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["00"]}]
     runs = [evaluated_run("AD", trained_on=record), evaluated_run("mine", trained_on=None)]
     text = unescape(write_page(runs, tmp_path / "report.html").read_text())
@@ -171,7 +171,7 @@ def test_headroom_card_lists_layouts_and_families_without_headroom(tmp_path):
     assert "**0.0 / 0.0 / 39.9**" in text and "No headroom: coord_simple/H1, coord_simple/H2" in text
 
 
-def test_shown_episodes_are_of_tasks_with_headroom(invented_responses, tmp_path, monkeypatch):
+def test_episodes_of_tasks_with_headroom_are_shown(invented_responses, tmp_path, monkeypatch):
     """Episodes are shown for layouts and families with headroom, and not for reference egos."""
     (tmp_path / "a.gif").write_bytes(GIF)
     monkeypatch.setattr(gifs, "save_episodes", lambda *a, **k: (ShownEpisode(1, 7.0, tmp_path / "a.gif"),))

@@ -28,7 +28,7 @@ def test_interval_and_p_value_of_normal_values_are_close_to_students_t():
     assert mean_interval(values) == found, "the random numbers are fixed"
 
 
-def test_interval_of_equal_values_is_a_point_and_of_too_few_values_is_nan():
+def test_equal_values_give_a_point_interval_and_too_few_values_give_nan():
     found = mean_interval(np.full(5, 7.0), np.full((3, 2), 1.0))
     assert found[:3] == (4.0, 4.0, 4.0) and found.p == 0 and found.text() == "4.0 (4.0 to 4.0)"
     pair = mean_interval(np.array([[1.0, 2.0]]))
@@ -44,7 +44,7 @@ def test_intervals_resample_instances_but_not_groups():
     assert mean_interval(np.full(3, 0.0), np.full(3, 10.0))[:3] == pytest.approx((5.0, 5.0, 5.0))
 
 
-def test_ratio_of_sums_has_a_wider_interval_over_training_runs():
+def test_interval_of_a_ratio_is_wider_over_several_training_runs():
     gains, scales = np.array([[1.0, 3.0, 2.0, 4.0]]), np.array([2.0, 4.0, 2.0, 8.0])
     one = Stratum(gains, scales)
     assert ratio_interval([[one], [Stratum(gains[:, :2], scales[:2])]]).mean == pytest.approx((10 / 16 + 4 / 6) / 2)
@@ -68,8 +68,8 @@ def test_holm_corrects_p_values():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trainings", [1, 5])
-def test_intervals_have_the_stated_coverage(trainings):
-    """Simulate four groups of five units with unequal variances, and an effect that is common to each training run."""
+def test_intervals_have_the_nominal_coverage(trainings):
+    """Simulate four groups of five units with unequal variances, and an effect of each training run on all units."""
     rng, covered, rounds = np.random.default_rng(1), 0, 800
     for _ in range(rounds):
         common = rng.normal(0.0, 0.5, (trainings, 1)) if trainings > 1 else np.zeros((1, 1))

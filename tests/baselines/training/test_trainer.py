@@ -210,7 +210,7 @@ class TestFolder:
 class TestStep:
     @pytest.mark.slow
     def test_accumulated_gradient_equals_gradient_of_complete_batch(self):
-        """Accumulating over parts with unequal padding gives the gradient of the complete batch."""
+        """The mean over two micro-batches with unequal padding is the gradient of the complete batch."""
         method = get_method("ad")(dataclasses.replace(MODEL, dropout=0.0), FLAT)
         one, parts = (Trainer(method, dataclasses.replace(OPTIONS, accumulate=n)) for n in (1, 2))
         batch = TinySampler().batch(0)
@@ -233,7 +233,7 @@ class TestStep:
         np.testing.assert_allclose(rates, [0.0, 6e-4, 1e-3, cosine, 0.0], rtol=1e-5, atol=1e-9)
 
     def test_indivisible_batch_size_raises_error(self):
-        with pytest.raises(OptionError, match="batch_size = 4: expected a multiple of 3, 1 devices x 3 parts"):
+        with pytest.raises(OptionError, match=r"batch_size = 4: .* 3, the number of devices \(1\) x accumulate \(3\)"):
             Trainer(get_method("ad")(MODEL, FLAT), dataclasses.replace(OPTIONS, accumulate=3))
 
 
@@ -254,7 +254,7 @@ def training_job(
 
 
 class TestHeldOut:
-    def test_held_out_parts_share_no_history_and_no_teammate(self, tmp_path, monkeypatch):
+    def test_held_out_histories_and_teammates_are_not_in_training_data(self, tmp_path, monkeypatch):
         """If teammates have no description, each task counts as a separate teammate."""
         random_release(tmp_path / "r", layouts=("demo_wide",), teammates=5, streams=4, episodes=2)
         dataset = load_icrl4aht(tmp_path / "r", obs="state")
@@ -305,7 +305,7 @@ class TestHeldOut:
             assert {cell["labels"] for cell in found.about["trained_on"]} == {labels}
             assert {sampler.labels for sampler in (found.data.train, *found.data.validation.values())} == {labels}
 
-    def test_samplers_use_the_options_every_and_queries(self, two_sources):
+    def test_options_every_and_queries_are_passed_to_samplers(self, two_sources):
         found = training_job(two_sources[0], context=40, every=3)
         assert {sampler.every for sampler in (found.data.train, *found.data.validation.values())} == {3}
         dpt = training_job(two_sources[0], "dpt", context=40, queries=3)

@@ -1,4 +1,4 @@
-"""Test recording of rollouts, selection of the streams of a release, and labels of recorded steps."""
+"""Test recording of rollouts, selection of streams (the histories of single environments), and their labels."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_recorded_arrays_equal_those_of_a_loop_over_steps(length, updates):
     rollouts = [random_rollout(length, rng) for _ in range(updates)]
     expected = record_by_loop(rollouts, config)
     found = empty_histories(config)
-    for number in (*reversed(range(updates)), *range(updates)):  # backwards, then once more forwards
+    for number in (*reversed(range(updates)), *range(updates)):  # record in reverse order, then again in order
         record_rollout(found, number, rollouts[number])
     for name, array in expected.items():
         assert array.size and not (array == UNTOUCHED).any(), name  # every entry was written
@@ -118,7 +118,7 @@ def test_streams_with_equal_scores_are_ordered_by_number():
 
 
 def improving(*improvements: int) -> np.ndarray:
-    """Return the episode returns (N, 10) of streams that start at 0 and improve by the given amounts."""
+    """Return the episode returns (N, 10) of histories that start at 0 and improve by the given amounts."""
     return np.array([[0.0] * 5 + [float(improvement)] * 5 for improvement in improvements])
 
 
@@ -126,7 +126,7 @@ def improving(*improvements: int) -> np.ndarray:
     ("learners", "keep", "expected"),
     [
         ([improving(10, 50, 30, 20), improving(15, 40, 25, 5)], 4, [[1, 2], [1, 2]]),
-        ([improving(10, 50, 30, 20), improving(15, 40, 25, 5)], 3, [[1, 2], [1]]),  # improvement 30 comes before 25
+        ([improving(10, 50, 30, 20), improving(15, 40, 25, 5)], 3, [[1, 2], [1]]),  # in round 2, 30 comes before 25
         ([improving(10, 20), improving(90, 80, 70, 60)], 3, [[1], [0, 1]]),
         ([improving(30, 20, 40, 50), improving(0, 5, 4, 0)], 8, [[3, 2, 0, 1], [1]]),
         ([improving(0), improving(0)], 2, [[], []]),
@@ -139,7 +139,7 @@ def test_selected_streams_are_divided_among_learners(learners, keep, expected):
 
 @pytest.fixture(scope="module")
 def labels_and_logits():
-    """Return labels of two streams of two episodes, and logits with memory resets at episodes, at steps, or never."""
+    """Return labels of two histories of two episodes, and logits with memory reset at episodes, at steps, or never."""
     widths = Widths(pointwise=(8,), spatial=(8,), dense=32, gru=16, head=16)
     network = ActorCritic(widths)
     rng = np.random.default_rng(3)

@@ -37,7 +37,7 @@ def profile(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def damaged_partial(profile, built, tmp_path) -> Path:
-    """Return the folder of a damaged partial artefact of the second task."""
+    """Write a damaged partial artefact for the second task, and return its folder."""
     (name,) = {work.name for work in load_profile(str(profile)).units()} - {artefact(built / "a").name}
     partial = partial_folder(tmp_path / "artefacts" / name)
     partial.mkdir(parents=True)
