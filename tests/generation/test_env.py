@@ -21,7 +21,7 @@ from icrl4aht_data.overcooked.state import State, columns, record_size, unpack
 from tests.helpers.states import random_records, state_record
 
 CRAMPED = LAYOUTS["cramped_up"]
-PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO is one piece of ingredient 0, ONE of 1
+PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are one piece of ingredient 0 and 1
 FOUR_RECIPES = np.array([3 * ZERO, 2 * ZERO + ONE, ZERO + 2 * ONE, 3 * ONE], np.uint8)
 
 N, MAX_STEPS, STEPS = 2000, 5, 13  # N environments in one batch
@@ -39,7 +39,7 @@ FLOOR = {  # floor cells (x, y) that the ego and the teammate can reach, read of
 }
 
 
-class Compiled(NamedTuple):
+class CompiledEnv(NamedTuple):
     """An environment with its functions `init` and `step`, each jitted once."""
 
     env: Environment
@@ -47,13 +47,13 @@ class Compiled(NamedTuple):
     step: jax.stages.Wrapped
 
     @classmethod
-    def jit(cls, env: Environment) -> Compiled:
+    def jit(cls, env: Environment) -> CompiledEnv:
         return cls(env, jax.jit(env.init), jax.jit(env.step))
 
 
 @pytest.fixture(scope="module")
-def cramped() -> Compiled:
-    return Compiled.jit(Environment(CRAMPED, max_steps=MAX_STEPS))
+def cramped() -> CompiledEnv:
+    return CompiledEnv.jit(Environment(CRAMPED, max_steps=MAX_STEPS))
 
 
 def some_keys(number: int) -> jax.Array:
@@ -77,7 +77,7 @@ class StepBatch(NamedTuple):
     actions: np.ndarray  # shape (STEPS, N, 2)
 
 
-def step_batch(compiled: Compiled, keys: jax.Array, actions: np.ndarray) -> StepBatch:
+def step_batch(compiled: CompiledEnv, keys: jax.Array, actions: np.ndarray) -> StepBatch:
     """Step through two episodes into a third; in the second step of each episode, every teammate delivers."""
     state, before, steps = compiled.init(keys), [], []
     actions = actions.copy()
@@ -111,7 +111,7 @@ def fields(layout: Layout, record: jax.Array) -> State:
 
 
 def assert_uniform(values: Sequence | np.ndarray, possible: int) -> None:
-    """Assert that `possible` values occur equally often: chi-square is below six standard deviations above its mean."""
+    """Assert that `possible` values occur equally often: chi-square is below its mean plus six standard deviations."""
     found, counts = np.unique(np.asarray(values), axis=0, return_counts=True)
     assert len(found) == possible
     expected = counts.sum() / possible
@@ -180,7 +180,7 @@ def test_only_environments_with_ended_episodes_restart(cramped, batch_steps):
 
 
 def test_results_of_an_environment_do_not_depend_on_its_batch(cramped, keys, actions, batch_steps):
-    """Two environments play the same steps in another order, without the other environments of the batch."""
+    """Two environments of the batch repeat their steps in a batch of two and get the same results."""
     which = np.array([1234, 0])
     found = step_batch(cramped, keys[which], actions[:, which])
     for ours, theirs in zip(found.steps, batch_steps.steps, strict=True):
@@ -193,7 +193,7 @@ def test_raw_random_keys_give_the_results_of_typed_keys(cramped, keys):
     np.testing.assert_array_equal(cramped.init(jax.random.key_data(keys)).record, cramped.init(keys).record)
 
 
-def recipe_transitions(compiled: Compiled, seed: int, deliveries: int) -> np.ndarray:
+def recipe_transitions(compiled: CompiledEnv, seed: int, deliveries: int) -> np.ndarray:
     """Deliver in every step; return recipes before and after each correct delivery, shape (deliveries * N, 2)."""
     state, pairs = compiled.init(some_keys(seed)), []
     for _ in range(deliveries):
@@ -225,7 +225,7 @@ def test_recipe_changes_only_after_correct_deliveries(batch_steps):
 
 
 def test_four_recipes_are_drawn_uniformly_at_starts_and_after_deliveries():
-    four = Compiled.jit(Environment(with_four_recipes(CRAMPED), max_steps=MAX_STEPS))
+    four = CompiledEnv.jit(Environment(with_four_recipes(CRAMPED), max_steps=MAX_STEPS))
     np.testing.assert_array_equal(four.env.tables.recipes, FOUR_RECIPES)
     started = fields(CRAMPED, four.init(some_keys(4)).record).recipe
     assert set(np.unique(started)) == set(FOUR_RECIPES.tolist())
@@ -247,7 +247,7 @@ def random_inputs(layout: Layout, size: int) -> tuple[np.ndarray, np.ndarray, np
 
 @pytest.fixture(scope="module")
 def jitted_rules() -> jax.stages.Wrapped:
-    """Return one compiled function for all layouts that steps the rules and observes the state before the step."""
+    """Return a compiled function that steps the rules of any layout and observes the state before the step."""
     return jax.jit(lambda tables, *inputs: (*rules.step(tables, *inputs), observe_both(tables, inputs[0])))
 
 

@@ -1,4 +1,4 @@
-"""Test that environments with several layouts in one batch play like those with a single layout."""
+"""Test that an environment with several layouts gives the results of a separate environment for each layout."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def keys_of(count: int) -> jax.Array:
 
 
 @pytest.mark.parametrize("number", range(len(NAMES)), ids=NAMES)
-def test_layout_in_a_group_plays_like_a_single_layout(recorded_steps, number):
+def test_each_of_several_layouts_gives_the_results_of_this_layout_alone(recorded_steps, number):
     layout, envs = GROUP[number], np.arange(number, ENVS, len(NAMES))
     own = padded_positions(layout, stack_tables(GROUP))
     part = {name: value[:, envs] for name, value in recorded_steps.items()}

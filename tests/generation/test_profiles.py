@@ -1,4 +1,4 @@
-"""Test profiles of releases, the tasks that profiles list, and task files."""
+"""Test the profiles of releases, the tasks that profiles list, and task files."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_shipped_profiles_list_valid_tasks(name):
         assert (work.task.recipes is not None) == (work.source == "search")
 
 
-def test_tasks_with_a_dish_have_generated_layouts_that_do_not_show_it():
+def test_generated_layouts_that_hide_the_recipe_have_tasks_with_a_wanted_dish():
     profile = load_profile("varied")
     for name in profile.generated:
         assert (name in profile.dishes) == (not get_layout(name).shows_recipe)
@@ -192,7 +192,7 @@ def test_sampled_teammates_are_used_by_ppo_and_noise_tasks(changed):
 
 @pytest.fixture
 def small_lists(monkeypatch) -> None:
-    """Replace the shipped lists of spread teammates by four training and one validation teammate on two layouts."""
+    """Replace the shipped lists of spread teammates by five teammates (one for validation) on each of two layouts."""
 
     def layout_spread(layout: str) -> LayoutSpread:
         chosen = tuple(

@@ -32,7 +32,7 @@ def assert_equal_batches(one, two) -> None:
 
 
 def batches_digest(root: Path) -> str:
-    """Return the SHA-256 of a few AD and DPT batches of the histories of a release on the layout demo_wide."""
+    """Return the SHA-256 of a few AD and DPT batches, drawn from a release's histories on demo_wide."""
     dataset = load_icrl4aht(root, layout="demo_wide")
     samplers = [
         dataset.ad(batch_size=5, length=40, seed=7, teammate_actions=True),

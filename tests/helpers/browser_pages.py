@@ -12,7 +12,7 @@ import numpy as np
 
 
 def embedded_data(html: bytes) -> tuple[dict[str, Any], list[bytes]]:
-    """Return the index of a page and the decompressed data of each of the page's histories."""
+    """Return a page's index and the decompressed data of each history on the page."""
     (text,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', html.decode(), re.DOTALL)
     data = json.loads(text)
     index, *histories = (zlib.decompress(base64.b64decode(one)) for one in (data["index"], *data["histories"]))
@@ -20,7 +20,7 @@ def embedded_data(html: bytes) -> tuple[dict[str, Any], list[bytes]]:
 
 
 def embedded_episodes(index: dict[str, Any], facts: dict[str, Any], content: bytes) -> dict[int, dict[str, np.ndarray]]:
-    """Return a dict from episode number to column name to values; the column "state" is uint8 (frames, S)."""
+    """Return episode number -> column name -> values of the column; the column "state" is uint8 (frames, S)."""
     size, names = index["layouts"][facts["layout"]]["record_size"], facts["columns"]
     columns = np.frombuffer(content, np.uint8).reshape(size + len(names), sum(facts["frames"]))
     named = {"state": columns[:size].T, **dict(zip(names, columns[size:], strict=True))}

@@ -60,7 +60,7 @@ SPAN = 20.0
 
 
 def write_invented_responses(path: Path) -> Path:
-    """Write invented best responses to the teammates of all test tasks; a layout's five H4 teammates share one."""
+    """Write invented best responses to all teammates of test tasks; a layout's five H4 teammates share a response."""
     stays, headroom, behaviours = stay_returns("seeded"), read_headroom("seeded"), []
     for (layout, family), egos in headroom.items():
         tasks = [task for task in TEST_TASKS if (task.layout.name, task.teammate_family) == (layout, family)]
@@ -81,12 +81,12 @@ def write_results(
     offset=0.0,
     **details,
 ) -> Path:
-    """Write results of all test tasks of a track as `evaluate` does, with equal returns for all three seeds.
+    """Write the result files of `evaluate` for all test tasks of a track, with equal returns for all three seeds.
 
     Args:
         curve: returns of the 100 episodes of a task.
         details: further details of the agent, such as `forget`.
-        offset: number added to the returns, multiplied by the teammate's index in its family.
+        offset: number by which returns rise from one teammate of a family to the next.
     """
     settings = {"agent": agent, "seeds": [0, 1, 2], "protocol": get_protocol("seeded").settings}
     details |= {} if trained_on is None else {"trained_on": [*trained_on]}

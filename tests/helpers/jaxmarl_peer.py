@@ -77,7 +77,7 @@ def from_jaxmarl_state(layout: Layout, state: JaxmarlState) -> np.ndarray:
 
 
 def jaxmarl_step(env: OvercookedV2):
-    """Return JaxMARL's step function, jitted and batched, of keys, states and actions (B, 2) in JaxMARL's ids."""
+    """Return JaxMARL's step function, jitted and batched; it takes keys, states and actions (B, 2) in JaxMARL's ids."""
 
     def single_step(key, state, actions):
         obs, state, reward, _, info = env.step_env(key, state, {"agent_0": actions[0], "agent_1": actions[1]})

@@ -57,7 +57,7 @@ def random_history(layout: Layout, episodes: int, length: int, rng: np.random.Ge
 
 
 def make_tasks(layouts: list[str], teammates: int = 1, recipes: Sequence[Dish] | None = None) -> list[Task]:
-    """Return tasks with different heuristic teammates; on training layouts the split is train, on others test."""
+    """Return tasks with different heuristic teammates; the split is "train" on training layouts, "test" on others."""
     return [
         make_task(
             track_of(layout),
@@ -131,7 +131,7 @@ def one_history_release(
     provenance: Provenance | None = None,
     learner: int = 0,
 ) -> Path:
-    """Write a release of one task on demo_simple with valid hashes, after passing the history's arrays to `change`."""
+    """Write a release of one history on demo_simple; `change` alters the arrays before their hashes are computed."""
     (task,) = make_tasks(["demo_simple"])
     arrays = change(random_history(task.layout, 6, 20, np.random.default_rng(5)))
     new = NewTask(task, provenance or Provenance(), 1, lambda: [NewHistory(0, arrays, learner)])

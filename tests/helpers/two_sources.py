@@ -37,7 +37,7 @@ PARTS = (("train", "ppo"), ("train", "noise"), ("validation", "noise"))
 def two_source_release(
     root: Path, ppo_episodes: int = EPISODES, oracle: tuple[str, ...] = SOURCES
 ) -> dict[int, dict[str, np.ndarray]]:
-    """Write a release with two tasks for each pair in `PARTS` on two layouts; return the written arrays by history id.
+    """Write a release with two tasks for each of two layouts and each pair in `PARTS`; return the arrays by history id.
 
     A PPO task has two learners with two histories of `ppo_episodes` episodes each; a noise task has three histories.
     All actions are random, so no learner improves. Histories of the sources in `oracle` have oracle actions.

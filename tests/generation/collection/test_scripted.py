@@ -31,7 +31,7 @@ from icrl4aht_data.errors import DiskFullError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.rules import step
 from icrl4aht_data.utils.files import file_hash
-from tests.generation.teammates.test_learned import save
+from tests.generation.teammates.test_learned import save_random_checkpoint
 from tests.helpers.commands import run_cli
 from tests.helpers.tiny import NOISE
 
@@ -116,7 +116,8 @@ def test_episode_depends_only_on_seed_history_and_episode_number(arrays):
     """Episodes of several histories, played in one batch, equal the episodes of the collected task."""
     mate = build_teammate(None, MATE)
     history, episode = np.array([3, 1, *[0] * 14]), np.array([2, 9, *range(14)])
-    chances = np.concatenate([arrays["noise"], arrays["noise"]], axis=1)  # episodes 10 to 13 reuse earlier noise
+    # Episodes 10 to 13 have the noise of episodes 0 to 3.
+    chances = np.concatenate([arrays["noise"], arrays["noise"]], axis=1)
 
     def play(seed):
         return next(play_scripted_histories(LAYOUT, mate, seed, "noise", [(history, episode)], chances))[1]
@@ -226,7 +227,7 @@ def test_noise_of_a_search_history_is_constant_until_its_last_episode():
 @pytest.mark.slow
 def test_scripted_histories_can_have_a_learned_teammate(profile, tmp_path):
     """The learned teammate takes the greedy actions of its policy."""
-    save(tmp_path / "suite/member", LAYOUT)
+    save_random_checkpoint(tmp_path / "suite/member", LAYOUT)
     theta = {"checkpoint": "member", "sha256": file_hash(tmp_path / "suite/member" / POLICY_WEIGHTS)}
     mate = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0, "theta": theta}
     work = Work(make_task("teammate", "train", "demo_wide", mate, 3), "noise")

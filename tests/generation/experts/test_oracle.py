@@ -1,4 +1,4 @@
-"""Test the scripted oracle ego: it makes no wrong deliveries and earns more than H4 in the ego's slot."""
+"""Test the scripted oracle ego: it makes no wrong deliveries and earns more than the heuristic H4 as the ego."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test which dish the scripted searcher believes to be wanted, when it acts itself and when it advises another ego."""
+"""Test which dish the scripted ego `searcher` believes to be wanted, if it acts itself or if another ego acts."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ FIRST, SECOND, MIXED, OTHER_MIXED = 3 << 2, 3 << 4, (2 << 2) + (1 << 4), (1 << 2
 jitted = cache(jax.jit)
 
 
-def believed(advises: bool, memory: Mapping[str, Any], **fields: Any) -> int:
-    """Return the dish that the searcher believes in after it has seen a state, with the given memory before."""
+def believed_dish(advises: bool, memory: Mapping[str, Any], **fields: Any) -> int:
+    """Return the item byte of the dish that the scripted ego, with the given memory, believes in after a new state."""
     script = searcher(LAYOUT, advises)
     start: SearchMemory = script.init(script.params, jax.random.key(0))
     start = start._replace(**{name: jnp.asarray(value) for name, value in memory.items()})
@@ -38,7 +38,7 @@ def believed(advises: bool, memory: Mapping[str, Any], **fields: Any) -> int:
     return int(DISHES[after.belief])
 
 
-def among(*dishes: int) -> np.ndarray:
+def dish_mask(*dishes: int) -> np.ndarray:
     """Return a mask of dishes, bool (10,)."""
     return np.isin(np.pad(DISHES, (0, 10 - len(DISHES))), dishes)
 
@@ -47,21 +47,21 @@ def among(*dishes: int) -> np.ndarray:
     ("fields", "memory", "expected"),
     [
         ({"pot_items": [2 << 2, 0]}, {}, {FIRST, MIXED}),
-        ({"pot_items": [2 << 2, 0]}, {"refused": among(FIRST)}, {MIXED}),
+        ({"pot_items": [2 << 2, 0]}, {"refused": dish_mask(FIRST)}, {MIXED}),
         ({"pot_items": [2 << 2, 0], "hands": [1 << 4, 0]}, {}, {MIXED}),
         ({"pot_items": [0, FIRST]}, {}, {FIRST}),
-        ({"pot_items": [0, FIRST]}, {"refused": among(FIRST)}, {SECOND, MIXED, OTHER_MIXED}),
+        ({"pot_items": [0, FIRST]}, {"refused": dish_mask(FIRST)}, {SECOND, MIXED, OTHER_MIXED}),
         ({"hands": [MIXED | PLATE | COOKED, 0]}, {}, {MIXED}),
-        ({"pot_items": [2 << 2, 0]}, {"paid": among(SECOND)}, {SECOND}),
+        ({"pot_items": [2 << 2, 0]}, {"paid": dish_mask(SECOND)}, {SECOND}),
     ],
 )
-def test_advising_searcher_believes_in_a_dish_that_the_ego_has_begun(fields, memory, expected):
+def test_belief_follows_a_dish_that_another_acting_ego_has_begun(fields, memory, expected):
     orders = np.pad(np.eye(4, dtype=np.float32), ((0, 0), (0, 6)))
-    found = {believed(True, {"order": order, **memory}, **fields) for order in orders}
+    found = {believed_dish(True, {"order": order, **memory}, **fields) for order in orders}
     assert found == expected
 
 
-def test_acting_searcher_keeps_its_belief_while_a_pot_is_in_use():
+def test_belief_stays_while_a_pot_is_in_use_if_the_scripted_ego_acts():
     belief = {"belief": np.int32(list(DISHES).index(SECOND))}
-    assert believed(False, belief, pot_items=[2 << 2, 0]) == SECOND
-    assert believed(True, belief, pot_items=[2 << 2, 0]) in {FIRST, MIXED}
+    assert believed_dish(False, belief, pot_items=[2 << 2, 0]) == SECOND
+    assert believed_dish(True, belief, pot_items=[2 << 2, 0]) in {FIRST, MIXED}

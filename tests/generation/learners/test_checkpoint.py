@@ -23,7 +23,7 @@ def policy():
     return network, jax.jit(network.untrained, static_argnums=1)(jax.random.key(0), layout.channels)
 
 
-def flat_kernel(folder) -> str:
+def sparse_kernel_name(folder) -> str:
     """Return the name of the only weight matrix that is stored without its zero rows."""
     (name,) = (name for name in load_file(folder / POLICY_WEIGHTS) if name.endswith("@rows"))
     return name.removesuffix("@rows")
@@ -51,7 +51,7 @@ def test_policy_is_restored_exactly_from_a_small_file(policy, tmp_path):
 def test_checkpoint_with_invalid_row_numbers_raises_error(policy, tmp_path, change):
     network, params = policy
     save_policy(tmp_path / "p", network, params, {})
-    name, weights = flat_kernel(tmp_path / "p"), load_file(tmp_path / "p" / POLICY_WEIGHTS)
+    name, weights = sparse_kernel_name(tmp_path / "p"), load_file(tmp_path / "p" / POLICY_WEIGHTS)
     card = json.loads((tmp_path / "p" / POLICY_CARD).read_text())
     weights[f"{name}@rows"], card["shapes"][name] = change(weights[f"{name}@rows"], card["shapes"][name])
     save_file(weights, tmp_path / "p" / POLICY_WEIGHTS)

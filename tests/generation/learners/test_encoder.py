@@ -29,7 +29,7 @@ def encoder(kind, view: CompactView | None = None) -> WindowEncoder:
     return WindowEncoder(12, kind, pointwise=(10, 6), spatial=(5,), normalize=True, view=view)
 
 
-def with_gradient(module: WindowEncoder) -> Any:
+def gradient_and_features(module: WindowEncoder) -> Any:
     """Return a function that computes the gradient of the features' weighted sum, and the features themselves."""
 
     def weighted_sum(params, seen):
@@ -52,8 +52,8 @@ def test_compact_inputs_give_the_features_and_gradients_of_observations(kind):
     jax.tree.map(np.testing.assert_array_equal, params, own)
     with jax.enable_x64(True):
         params = jax.tree.map(lambda values: values.astype(jnp.float64), params)
-        expected_gradient, expected = with_gradient(plain)(params, obs)
-        gradient, features = with_gradient(compact)(params, seen)
+        expected_gradient, expected = gradient_and_features(plain)(params, obs)
+        gradient, features = gradient_and_features(compact)(params, seen)
         again: Any = jax.jit(compact.apply)(params, obs)  # the encoder also accepts observations
     assert features.shape == (3, 20, 12) and features.dtype == jnp.float64
     found, wanted = (
@@ -65,7 +65,7 @@ def test_compact_inputs_give_the_features_and_gradients_of_observations(kind):
 
 
 def test_only_entries_that_can_differ_from_0_have_nonzero_initial_weights():
-    """Observation entries that are always 0 on a layout have no effect on other layouts before training."""
+    """Entries that are always 0 on the encoder's layout start with weight 0, so they have no effect before training."""
     obs, view = jnp.asarray(observe(LAYOUT, RECORDS, 0)), CompactView("mlp", (LAYOUT,))
     kernels = {}
     for name, module, seen in (
@@ -83,7 +83,7 @@ def test_only_entries_that_can_differ_from_0_have_nonzero_initial_weights():
 
 
 def test_view_of_both_agents_has_more_entries_than_view_of_the_ego():
-    """On demo_wide the agents stand in separate rooms, so the teammate observes entries that the ego never does."""
+    """On demo_wide the agents are in separate rooms, so the teammate observes entries that the ego never observes."""
     ego, both = (CompactView("mlp", (LAYOUT,), agents) for agents in ((0,), (0, 1)))
     assert len(ego.entries) < len(both.entries)
     assert set(ego.entries) <= set(both.entries)

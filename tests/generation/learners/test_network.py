@@ -78,7 +78,7 @@ class Case(NamedTuple):
 
 @pytest.fixture(scope="module")
 def case() -> Case:
-    """Return a small network with unequal widths and random nonzero parameters, and observations with three resets."""
+    """Return a small network with unequal widths, random nonzero parameters, and random inputs with three resets."""
     widths = Widths(pointwise=(6, 4), spatial=(3, 5), dense=11, gru=7, head=9)
     network, rng = ActorCritic(widths), np.random.default_rng(1)
     shape = (STEPS, ENVS, 5, 5, CHANNELS)
@@ -112,8 +112,8 @@ def test_outputs_and_gradients_equal_those_of_the_reference_network(case):
     names = plain_names(case.params, case.network.widths)
     weights = jax.random.normal(jax.random.key(4), (STEPS, ENVS, 7))
 
-    def with_gradients(network):
-        """Return a function that computes the gradients of the weighted sum of all outputs, and these outputs."""
+    def gradients_and_outputs(network):
+        """Return a function that computes the gradients of a weighted sum of the outputs, and the outputs."""
 
         def weighted_sum(params, hidden):
             outputs = network.apply(params, hidden, case.obs, case.reset)
@@ -122,8 +122,8 @@ def test_outputs_and_gradients_equal_those_of_the_reference_network(case):
 
         return jax.jit(jax.grad(weighted_sum, argnums=(0, 1), has_aux=True))
 
-    (gradient, to_hidden), outputs = with_gradients(case.network)(case.params, case.hidden)
-    (plain_gradient, plain_to_hidden), plain_outputs = with_gradients(plain)(names, case.hidden)
+    (gradient, to_hidden), outputs = gradients_and_outputs(case.network)(case.params, case.hidden)
+    (plain_gradient, plain_to_hidden), plain_outputs = gradients_and_outputs(plain)(names, case.hidden)
     for found, expected in zip(outputs, plain_outputs, strict=True):
         assert found.shape == expected.shape
         assert_close(found, expected)

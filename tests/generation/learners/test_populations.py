@@ -66,7 +66,7 @@ def test_brdiv_has_three_quarters_self_play_and_all_cross_play_pairs(members, en
 
 
 @pytest.mark.parametrize("environments", [8, 16, 256])
-def test_comedi_divides_environments_into_four_equal_kinds_of_play(environments):
+def test_comedi_divides_environments_equally_among_four_kinds_of_play(environments):
     assignment = CoMeDi().assignment(environments)
     quarter = environments // 4
     play, cross, mixed, from_mixed = np.split(assignment.policy, 4, axis=1)
@@ -117,10 +117,10 @@ def test_critics_receive_the_partner_if_partners_vary():
     assert population(FCP(1), partners=2).network.partners == 2
 
 
-def weights_by_paper(algorithm: Any, memory: Any) -> np.ndarray:
-    """Return the weight of each slot's return in the objective of the slot's policy, float64 (2, N).
+def paper_slot_weights(algorithm: Any, memory: Any) -> np.ndarray:
+    """Return each slot's weight in the paper's objective of the policy that plays the slot, float64 (2, N).
 
-    The objectives are the paper's equations. The expected return of a pair of policies is the mean over its slots.
+    The mean return over the slots of two policies stands for their expected return in the paper's equations.
     """
     assignment = algorithm.assignment(16)
     k = getattr(algorithm, "members", 0)
@@ -131,7 +131,7 @@ def weights_by_paper(algorithm: Any, memory: Any) -> np.ndarray:
         elif isinstance(algorithm, CoMeDi):
             quarter = env // 4
             alpha, beta = algorithm.cross_play_weight, algorithm.mixed_play_weight
-            mixed = beta / 2 / 4 if left == right else beta / 2 / 2  # the terms of J_MP average 4 and 2 slots
+            mixed = beta / 2 / 4 if left == right else beta / 2 / 2  # J_MP: means over 4 self-play slots and 2 others
             both = {0: 1 / 8, 1: -alpha / 4, 2: 0, 3: mixed}[quarter]
             expected[:, env] = [both * (left == 0), both * (right == 0)]
         else:
@@ -172,7 +172,7 @@ def test_slot_weights_follow_the_equations_of_the_paper(algorithm, memory):
     trained = population(algorithm)
     found = np.asarray(trained._slot_weights(memory))
     expected, policy, counts = (
-        weights_by_paper(algorithm, memory).ravel(),
+        paper_slot_weights(algorithm, memory).ravel(),
         trained.assignment.policy.ravel(),
         trained.assignment.term >= 0,
     )
@@ -194,7 +194,7 @@ def random_returns(k: int, rng: np.random.Generator, share: float) -> tuple[np.n
 
 
 def test_lbrdiv_multipliers_follow_the_update_of_the_paper():
-    """Compare a sequence of updates that see different shares of the pairs."""
+    """Compare the multipliers after each of seven updates that observe different shares of the pairs."""
     k, rng = 4, np.random.default_rng(12)
     algorithm = LBRDiv(k, tolerance=0.3, learning_rate=0.05)
     found, expected = algorithm.init(), algorithm.init()

@@ -116,7 +116,7 @@ def run_updates(update: UpdateFunction, state: LearnerState, updates: int) -> Up
 
 @pytest.fixture(scope="module")
 def played(update, frozen_state) -> UpdateSequence:
-    """Return 40 updates from the fixture `frozen_state`, in which the policy never changes."""
+    """Return 40 updates that start at `frozen_state` and never change the policy."""
     return run_updates(update, frozen_state, 40)
 
 
@@ -189,7 +189,7 @@ def test_training_sequences_replay_a_roll_out_across_episodes(learner, played):
 
 
 def test_ppo_loss_equals_formulas_in_numpy(learner, played):
-    """Compare the loss with formulas in NumPy, at changed parameters with clipped ratios and values."""
+    """Compare the loss with NumPy formulas; with other parameters than the rollout's, ratios and values are clipped."""
     rollout = played.rollouts[1]
     rng = np.random.default_rng(6)
     params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.1, played.before[1].params)

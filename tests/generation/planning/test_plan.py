@@ -61,7 +61,7 @@ def test_cost_of_noise_histories_includes_no_learners(tmp_path):
 def test_estimated_sizes_match_the_bundled_release():
     dataset = load_icrl4aht()
     shards = sum(path.stat().st_size for path in (dataset.root / "data").rglob("*.h5"))
-    # Source agent is left out, since it has few histories.
+    # Histories of the source `agent` are left out, since there are only a few.
     made = [entry for entry in dataset.entries if entry.source != "agent"]
     expected = sum(
         entry.T * plan.BYTES_PER_STEP["lite", str(entry.source)] + plan.BYTES_PER_HISTORY.get(str(entry.source), 0)

@@ -1,4 +1,4 @@
-"""Test Hamming distances between the actions of policies and of families on the same states."""
+"""Test Hamming distances between policies, and between families, by their actions on the same states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test populations on disk: checkpoints and cards, interrupted runs, selection of teammates, and manifests.
+"""Test the training of populations, their checkpoints and cards, the selection of teammates, and manifests.
 
 Each algorithm is trained at most once, with the shipped profile `smoke` and one epoch: two members and six updates of
 2,048 steps. Tests that are not marked slow train only LBRDiv.
@@ -165,7 +165,7 @@ def test_population_log_has_a_line_for_each_update(trained, algorithm):
     assert [(line["stage"], line["update"]) for line in lines] == [(s, u) for s in range(stages) for u in range(6)]
     for line in lines:
         assert line["step"] == 2048 * (line["update"] + 1)
-        ended = line["update"] in (1, 3, 4)  # an episode of 400 steps ends in these rollouts of 256 steps
+        ended = line["update"] in (1, 3, 4)  # episodes (400 steps) end in these rollouts (256 steps)
         assert (line["episodes"] > 0, "self_play" in line) == (ended, ended)
         meets_others = algorithm in ("brdiv", "lbrdiv") or line["stage"] > 0
         assert ("cross_play" in line) == (ended and meets_others)
@@ -248,7 +248,7 @@ def test_population_on_two_devices_learns_the_same_policies(tmp_path):
 
 
 def write_suite_with_returns(root: Path, returns: dict[tuple[int, int], float], algorithm: str = "fcp") -> Path:
-    """Write a suite whose checkpoints (member, checkpoint) have the given returns; all weight files differ."""
+    """Write a suite with the given returns by (member, checkpoint); the weight files of all checkpoints differ."""
     folder = population_folder(root, algorithm)
     for (member, checkpoint), greedy in returns.items():
         params = {"params": {"x": np.array([member, checkpoint, ALGORITHMS.index(algorithm)], np.float32)}}
@@ -261,7 +261,7 @@ def write_suite_with_returns(root: Path, returns: dict[tuple[int, int], float], 
 
 @pytest.fixture(scope="module")
 def candidates(tmp_path_factory) -> Path:
-    """Return a suite with 50 checkpoints of each algorithm: 40 exceed the threshold of 20, and 5 equal it."""
+    """Return a suite with 50 checkpoints of each algorithm: 40 have returns above the threshold of 20, 5 exactly 20."""
     root = tmp_path_factory.mktemp("candidates")
     for algorithm in ALGORITHMS:
         returns = {(m, c): 21.0 + m + c for m in range(10) for c in range(5)}
@@ -275,7 +275,7 @@ def paths(points: list[SuiteCheckpoint]) -> list[str]:
 
 
 def test_only_checkpoints_with_returns_above_the_threshold_are_selected(candidates):
-    """CoMeDi's first policy is not a candidate, because it is trained only by self-play, like the members of FCP."""
+    """CoMeDi's first policy, which is trained only by self-play, is not a candidate."""
     for algorithm, first, counts in (("fcp", 0, (50, 40)), ("comedi", 1, (45, 37))):
         found = paths(list(suite_checkpoints(candidates, LAYOUT.name, algorithm)))
         assert found == [f"{LAYOUT.name}/{algorithm}/m{m}/c{c}" for m in range(first, 10) for c in range(5)]

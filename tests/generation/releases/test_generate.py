@@ -1,4 +1,4 @@
-"""Test releases from tiny profiles: collected tasks, packaging, learned teammates and invalid folders."""
+"""Test how releases are generated from tiny profiles: tasks, packaging, learned teammates and invalid folders."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ def test_history_has_the_first_100_of_each_400_steps(built):
     assert [line["step"] for line in metrics] == [640 * (k + 1) for k in range(25)]
 
 
-def test_release_keeps_the_best_streams_in_order_of_their_score(built):
+def test_release_keeps_the_histories_with_the_highest_scores_in_order(built):
     rewards = np.load(artefact(built / "a") / "rewards.npy")
     returns = rewards.reshape(8, 5, 100).sum(axis=-1)
-    scores = 2 * returns.mean(axis=1) - returns.mean(axis=1)  # start and end are means over the same five episodes
+    scores = 2 * returns.mean(axis=1) - returns.mean(axis=1)  # 2 * end - start, both means of five episodes
     kept = [entry.env_idx for entry in load_icrl4aht(built / "a" / "lite").entries]
     assert kept == np.argsort(-scores, kind="stable")[:3].tolist()
 
@@ -130,7 +130,7 @@ def test_bundle_release_replaces_the_bundled_release(built, monkeypatch, tmp_pat
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_measurements():
-    """Return fixed values instead of slowly measuring distances and returns for learned teammates."""
+    """Replace the slow measurements of learned teammates' distances and returns by fixed values."""
     measure_checkpoints = labeller._measure
 
     def measure_unless_learned(checkpoints, task, suite) -> CheckpointReturns:

@@ -1,4 +1,4 @@
-"""Test the checkpoint that labels a task's histories: its choice by measured returns, and its stored policy."""
+"""Test the choice of the checkpoint whose actions label a task's histories, and the storage of this policy."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from tests.helpers.tiny import artefact
 def returns_with_means(*means: float, spread: float = 0.0) -> np.ndarray:
     """Return episode returns (C, E) of C checkpoints with the given means.
 
-    `spread` is the standard deviation of the difference between two checkpoints in an episode.
+    `spread` is the standard deviation, over episodes, of the difference between two checkpoints' returns.
     """
     noise = np.random.default_rng(0).normal(size=(len(means), LABEL_EPISODES)) * spread / np.sqrt(2)
     return np.array(means)[:, None] + noise - noise.mean(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Test packaging a release: selected streams, noise histories, labels, omitted tasks, and measured teammates."""
+"""Test how a release is packaged: selected histories, noise histories, labels, omitted tasks and measured teammates."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def profile(built) -> Profile:
 
 
 def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequence[float], greedy: float) -> None:
-    """Write the artefact of a learner whose first streams improve by `improvements` within ten episodes.
+    """Write the artefact of a learner with 8 histories of ten episodes; history k improves by `improvements[k]`.
 
-    Every checkpoint has the measured greedy return `greedy`.
+    Later histories do not improve. Every checkpoint has the measured greedy return `greedy`.
     """
     folder = artefacts / work.name
     shutil.copytree(artefact(built / "a"), folder)
@@ -59,7 +59,7 @@ def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequenc
     (folder / LABELLER_RETURNS).write_text(json.dumps(measured))
 
 
-def make_noise(built: Path, work: Work, artefacts: Path) -> None:
+def make_noise_task(built: Path, work: Work, artefacts: Path) -> None:
     """Write the artefact of a task with two noise histories."""
     source, folder = artefact(built / "a"), artefacts / work.name
     folder.mkdir(parents=True)
@@ -86,7 +86,7 @@ def package_tasks(tmp_path: Path, profile: Profile, works: Sequence[Work], facts
 
 @pytest.fixture
 def two_learners(built, profile, tmp_path) -> list[Work]:
-    """Return two learners of one task: three streams of the first and one of the second improve by 5 or more."""
+    """Return two learners of one task: 3 histories of the first and 1 history of the second improve by 5 or more."""
     (task,) = make_tasks(profile, 1)
     works = [Work(task, "ppo", learner) for learner in range(2)]
     make_learner(built, works[0], tmp_path / "artefacts", [10, 4, 20, 15], 5.0)
@@ -94,7 +94,7 @@ def two_learners(built, profile, tmp_path) -> list[Work]:
     return works
 
 
-def test_improving_streams_of_both_learners_are_kept(two_learners, profile, tmp_path):
+def test_improving_histories_of_both_learners_are_kept(two_learners, profile, tmp_path):
     task_id = two_learners[0].task.task_id
     strict = replace(profile, least_improvement=5.0, oracle_actions=True)
     root = package_tasks(tmp_path, strict, two_learners, {task_id: MATTERS})
@@ -108,7 +108,7 @@ def test_improving_streams_of_both_learners_are_kept(two_learners, profile, tmp_
     assert made.filter.least_improvement == 5.0
     assert made.filter.before.return_end == pytest.approx((10 + 4 + 20 + 15 + 3 + 25) / 16, abs=1e-3)
     assert made.expert is not None
-    assert made.expert.return_greedy == 7.0  # the labeller is a checkpoint of the better learner
+    assert made.expert.return_greedy == 7.0  # labels come from a checkpoint of the better learner
     for history in dataset:
         wanted = oracle_labels(LAYOUTS["demo_wide"], history.state[:], history.actions[:].astype(np.int8))
         assert history.entry.has_oracle_actions
@@ -143,7 +143,7 @@ def test_minimum_improvement_is_not_required_without_headroom(two_learners, prof
     assert "No headroom on demo_wide:" in (root / "README.md").read_text()
 
 
-def test_tasks_without_improving_streams_or_headroom_are_left_out(built, two_learners, profile, tmp_path):
+def test_tasks_without_improving_histories_or_headroom_are_left_out(built, two_learners, profile, tmp_path):
     flat = make_tasks(profile, 2)[1]
     works = [*two_learners, *(Work(flat, "ppo", learner) for learner in range(2))]
     for work in works[2:]:
@@ -164,7 +164,7 @@ def test_tasks_without_improving_streams_or_headroom_are_left_out(built, two_lea
 
 
 def test_tasks_with_little_mean_improvement_are_left_out(built, two_learners, profile, tmp_path):
-    """The kept streams of the first task improve by 17.5 on average, those of the second task by 5.5."""
+    """The kept histories of the first task improve by 17.5 on average, and those of the second task by 5.5."""
     flat = make_tasks(profile, 2)[1]
     make_learner(built, work := Work(flat, "ppo"), tmp_path / "artefacts", [4, 6, 3, 5], 5.0)
     works, task_id = [*two_learners, work], two_learners[0].task.task_id
@@ -183,7 +183,7 @@ def test_tasks_with_little_mean_improvement_are_left_out(built, two_learners, pr
 def test_noise_histories_are_labelled_by_their_scripted_ego(built, profile, tmp_path):
     (task,) = make_tasks(profile, 1)
     work = Work(task, "noise")
-    make_noise(built, work, tmp_path / "artefacts")
+    make_noise_task(built, work, tmp_path / "artefacts")
     both = replace(profile, sources=("noise",), oracle_actions=True, least_improvement=5.0)
     root = package_tasks(tmp_path, both, [work], {task.task_id: MATTERS})
     dataset = load_icrl4aht(root)

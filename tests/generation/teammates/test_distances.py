@@ -1,4 +1,4 @@
-"""Test distances of teammates to test teammates, groups of equal behaviour, and returns of reference egos."""
+"""Test the distances from teammates to test teammates, groups of equal behaviour, and returns of reference egos."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_test_teammate_has_distance_0_to_itself():
 
 @pytest.mark.slow
 def test_measured_draws_equal_the_stored_table():
-    """Values measured again agree, except for the number of the behaviour, which depends on earlier draws."""
+    """New measurements equal the stored values, except the behaviour's number, which depends on earlier draws."""
     numbers = [("assembly_line", 0, 0), ("assembly_line", 0, 31), ("assembly_line", 1, 5)]
     for found, (family, base_seed, theta_id) in zip(measure_draws(SHIPPED, numbers), numbers, strict=True):
         expected = read_draws(SHIPPED.name, family, base_seed)[theta_id]

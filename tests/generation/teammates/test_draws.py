@@ -1,4 +1,4 @@
-"""Test teammates with drawn parameters: the shipped table of measured draws, and the choice of draws for tasks."""
+"""Test the shipped table of measured teammates with drawn parameters, and the choice of these teammates for tasks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ UNCACHED = draws._bundled_draws.__wrapped__
 
 
 def draw(family: str, theta_id: int, behaviour: int = 0, *, base_seed=0, distance=0.5, oracle=30.0) -> Draw:
-    """Return a measured draw on demo_wide: the ego `stay` earns 1 and the ego `random` earns 2."""
+    """Return a measured teammate on demo_wide, with which the ego `stay` earns 1 and the ego `random` earns 2."""
     return Draw(
         "demo_wide", family, base_seed, theta_id, "H3/t0", distance, behaviour, 1.0, 2.0, oracle, "H1/t1", distance
     )
@@ -137,7 +137,7 @@ def test_draws_alternate_between_families_and_start_with_new_behaviours(monkeypa
 
 
 def test_draws_with_more_headroom_come_first(monkeypatch, tmp_path):
-    """Draws are sorted by headroom: first the lowest-numbered draw of each behaviour, then all other draws.
+    """The lowest-numbered draw of each behaviour comes first, then all other draws, both sorted by headroom.
 
     Draws that are similar to test teammates of other families come last.
     """
@@ -170,7 +170,7 @@ def test_draws_without_headroom_are_left_out_if_other_draws_have_headroom(monkey
     assert chosen_draws([H1, H3], 2) == [(H1, 0), (H3, 0)]
 
 
-def test_unknown_names_of_draws_raise_errors():
+def test_unknown_family_layout_or_seed_of_draws_raises_error():
     with pytest.raises(UnknownNameError, match=f"unknown teammate family 'H4'; valid: {H1}, "):
         drawn_teammates("demo_wide", ["H4"], 1)
     with pytest.raises(UnknownNameError, match="unknown training layout 'asymm_right'"):

@@ -334,7 +334,7 @@ ASYMM_CASES = [
     (H2, INVADER, {"pot_items": [SOUP_0, SOUP_0]}, "1 53-v 13- interact"),
 ]
 DEMO_CASES = [
-    # A stubborn H3 with empty hands walks to its home cell: (5, 3) for agent 1; for agent 0 this cell is a wall.
+    # A stubborn H3 with empty hands walks to its home cell (5, 3) as agent 1; the home cell of agent 0 is a wall.
     (H3, {"stubbornness": 1.0}, {}, "1 13- 51- right, 1 130 51- right, 0 41- 13- left"),
     (H3, {}, {}, "1 13- 51- down"),
 ]
@@ -372,7 +372,7 @@ SURE = {"press_L_when_unknown": 1.0, "cost_sensitivity": 0.0}
 
 
 def split_key(key: jax.Array, n: int) -> list[int]:
-    """Return the data of a key after n splits that keep the first of the two new keys."""
+    """Return the data of a random key that was split n times, each time keeping the first of two new keys."""
     for _ in range(n):
         key = jax.random.split(key)[0]
     return jax.random.key_data(key).tolist()
@@ -409,7 +409,7 @@ def greedy_memory(intent: int = -1, wait: int = 0) -> GreedyMemory:
 
 
 def move_greedy_up(slot: int, partner: tuple[int, int, str], memory: GreedyMemory) -> tuple[np.ndarray, GreedyMemory]:
-    """Return actions and memories of `utility_greedy` at (1, 2), which has empty hands and wants to go up to pile 0."""
+    """Return actions and memories of `utility_greedy` at (1, 2), on its way up to pile 0 with empty hands."""
     layout, mover = LAYOUTS["cramped_up"], (1, 2, "up")
     record = state_record(layout, *((mover, partner) if slot == 0 else (partner, mover)))
     memories = first_memories() | {(H4, slot): memory}

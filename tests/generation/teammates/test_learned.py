@@ -1,4 +1,4 @@
-"""Test learned teammates from checkpoints: greedy or sampled actions, memory, both agent slots, and errors."""
+"""Test how learned teammates act: greedy or sampled actions, memory, both agent slots, and invalid checkpoints."""
 
 from __future__ import annotations
 
@@ -28,8 +28,10 @@ WIDTHS = Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=8)
 STEPS, ENVS = 5, 3
 
 
-def save(folder: Path, layout: Layout = LAYOUT, widths: Widths = WIDTHS, partners: int = 0, seed: int = 0) -> Any:
-    """Save a checkpoint with random parameters, which act far from uniformly; return the parameters."""
+def save_random_checkpoint(
+    folder: Path, layout: Layout = LAYOUT, widths: Widths = WIDTHS, partners: int = 0, seed: int = 0
+) -> Any:
+    """Save a checkpoint of random parameters with action probabilities far from uniform; return the parameters."""
     network, rng = ActorCritic(widths, partners), np.random.default_rng(seed)
     shapes = jax.eval_shape(lambda key: network.untrained(key, layout.channels), jax.random.key(0))
     params = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32) * 0.5, shapes)
@@ -39,11 +41,11 @@ def save(folder: Path, layout: Layout = LAYOUT, widths: Widths = WIDTHS, partner
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory) -> Path:
-    """Return a suite with checkpoints a and b, and c for layout test_simple; only the critic of a sees the partner."""
+    """Return a suite with checkpoints a, b, and (for test_simple) c; only the critic of a sees the partner."""
     root = tmp_path_factory.mktemp("suite")
-    save(root / "a", partners=4)
-    save(root / "b", seed=1)
-    save(root / "c", get_layout("test_simple"))
+    save_random_checkpoint(root / "a", partners=4)
+    save_random_checkpoint(root / "b", seed=1)
+    save_random_checkpoint(root / "c", get_layout("test_simple"))
     return root
 
 
@@ -53,7 +55,7 @@ def states(steps: int, seed: int) -> np.ndarray:
 
 
 def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.ndarray:
-    """Return logits (T, N, 6) of the network, built with its critic, for a sequence of states."""
+    """Return the logits (T, N, 6) of the whole actor-critic network on a sequence of states."""
     obs = observe(LAYOUT, record, slot)
     network = ActorCritic(WIDTHS, partners)
     reset = np.arange(len(record))[:, None] == np.zeros(ENVS)
@@ -77,7 +79,7 @@ def played_actions(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
 
 @pytest.mark.parametrize("slot", [EGO, TEAMMATE])
 def test_greedy_action_is_the_most_probable_given_the_memory_of_the_episode(tmp_path, slot):
-    params = save(tmp_path / "a", partners=4)
+    params = save_random_checkpoint(tmp_path / "a", partners=4)
     record = states(STEPS, 2)
     logits = logits_of(params, 4, record, slot)
     actions = played_actions(learned.build_learned(LAYOUT, tmp_path / "a"), record, slot)
@@ -89,7 +91,7 @@ def test_sampled_actions_follow_the_policys_probabilities(suite):
     """Shares of 3,000 sampled actions in one state are within five standard deviations of the probabilities."""
     greedy, sampled = (learned.build_learned(LAYOUT, suite / "b", action) for action in ("greedy", "sampled"))
     record = states(1, 8)[:, :1]
-    params = {"params": save(suite.parent / f"{suite.name}-b", seed=1)["params"]}
+    params = {"params": save_random_checkpoint(suite.parent / f"{suite.name}-b", seed=1)["params"]}
     logits = logits_of(params, 0, np.repeat(record, ENVS, axis=1), TEAMMATE)[0, 0]
     probability = np.exp(logits) / np.exp(logits).sum()
     obs, keys = observe(LAYOUT, record[0, 0], TEAMMATE), jax.random.split(jax.random.key(1), 3000)
@@ -132,7 +134,7 @@ def test_checkpoint_of_another_layout_raises_error_with_both_shapes(suite):
 def test_incomplete_checkpoint_raises_error_with_expected_files(tmp_path, missing):
     folder = tmp_path / "gone"
     if missing != ".":
-        save(folder)
+        save_random_checkpoint(folder)
         (folder / missing).unlink()
     with pytest.raises(OptionError, match=rf"gone: not a checkpoint .*expected {POLICY_WEIGHTS} and {POLICY_CARD}"):
         learned.build_learned(LAYOUT, folder)

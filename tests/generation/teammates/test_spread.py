@@ -1,4 +1,4 @@
-"""Test spread teammates, whose actions differ widely: their choice, the shipped list, and random actions."""
+"""Test the choice and the shipped list of teammates whose actions differ widely, and the share of random actions."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def small_spread(monkeypatch) -> LayoutSpread:
 
 
 def test_the_farthest_candidate_is_chosen_next():
-    """On a line, both end points are chosen first, then the middle; the point 0.05 is too near the point 0."""
+    """Of points on a line, 0 and 1 are chosen first, then 0.35; the point 0.05 is too near 0."""
     assert choose_spread(DISTANCES, 0.1, 9) == ([0, 3, 2], [1.0, 1.0, pytest.approx(0.35)])
     assert choose_spread(DISTANCES, 0.04, 9)[0] == [0, 3, 2, 4, 1]
     assert choose_spread(DISTANCES, 0.05, 2)[0] == [0, 3]

@@ -126,7 +126,7 @@ def test_spread_episodes_returns_evenly_spaced_episodes(number, most):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_drawings_stored_in_the_page_equal_the_shapes_of_each_state(layout):
+def test_stored_drawings_equal_the_shapes_drawn_for_each_part_of_a_state(layout):
     records = random_records(layout, 50, np.random.default_rng(0))
     drawings = layout_drawings(layout, records)
     json.dumps(drawings)

@@ -21,7 +21,7 @@ from tests.robustness.limits import time_limit
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
-    """Return a release of the bundled PPO histories of one task with a learned teammate (read-only)."""
+    """Return a release with the bundled PPO histories of one task that has a learned teammate (read-only)."""
     dataset = load_icrl4aht(source="ppo", teammate_kind="fcp")
     return to_release(dataset.filter(task_id=dataset.entries[0].task_id), tmp_path_factory.mktemp("meta") / "r", "lite")
 
@@ -89,11 +89,11 @@ def test_teammate_field_in_provenance_is_refused(release, tmp_path):
 
 
 def test_verify_finds_false_values_in_a_release_without_tasks(converted_release, tmp_path):
-    def make_lines_false(lines: list) -> None:
+    def set_wrong_values(lines: list) -> None:
         lines[1].update(seed=3)
         lines[0].update(task_id=lines[-1]["task_id"])
 
-    found = "\n".join(problems(spoiled_copy(converted_release, tmp_path / "r", HISTORIES, make_lines_false), "quick"))
+    found = "\n".join(problems(spoiled_copy(converted_release, tmp_path / "r", HISTORIES, set_wrong_values), "quick"))
     assert "history 1: seed: expected -1 without tasks, found 3" in found
     assert "of one task differ in" in found
 
