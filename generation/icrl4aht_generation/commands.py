@@ -383,7 +383,7 @@ def teammates(
         available = profile.algorithms or dict.fromkeys(profile.layouts, ALGORITHMS)
         wanted = {layout: [name for name in names if name in algorithms] for layout, names in available.items()}
         if not any(wanted.values()):
-            raise OptionError(f"profile {profile.name} trains no teammates with {', '.join(algorithms)}; give --layout")
+            raise OptionError(f"profile {profile.name} trains no teammates by {', '.join(algorithms)}; give --layout")
     build_suite(profile, suite, wanted, seed, console, options)
 
 
@@ -395,8 +395,8 @@ def teammates(
 def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
     """Report how much the teammates of a suite differ.
 
-    Prints self-play and cross-play returns of each population and the Hamming distances of all teammates. Writes
-    nothing.
+    Prints self-play and cross-play returns of each population, and mean Hamming distances between the teammates of
+    algorithms and heuristics. Writes nothing.
     """
     from icrl4aht_generation.populations.build import report_diversity
 

@@ -63,7 +63,7 @@ class EnvStep(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Environment:
-    """OvercookedV2 as the benchmark uses it (paper, Sec. 3.1 and App. A).
+    """The benchmark's version of OvercookedV2 (paper, Sec. 3.1 and App. A), in batches of N environments.
 
     Observations: uint8 (N, 2, 5, 5, C) from `observe(state)`; `icrl4aht_data.overcooked.observe` lists the channels.
     Actions: int (N, 2), of ego and teammate, 0..5 (up, down, left, right, stay, interact).
@@ -145,7 +145,7 @@ class Environment:
         return EnvStep(after, outcome.reward, outcome.shaped, done, outcome.state)
 
     def call_with_tables(self, function: Callable[..., Any], layout: Int[Array, " N"] | None, *arguments: Array) -> Any:
-        """Call a function with the layout tables of every environment and further arrays.
+        """Call a function for every environment, with the tables of the environment's layout and further arrays.
 
         Args:
             function: function of the tables of one layout, and of arrays with or without a leading axis (N,).
@@ -157,7 +157,7 @@ class Environment:
         return jax.vmap(lambda number, *own: function(self.tables_of(number), *own))(layout, *arguments)
 
     def tables_of(self, layout: Int[Array, ""] | None) -> Tables:
-        """Return the tables of a layout by its number, or of the only layout for None."""
+        """Return the tables of the layout with the given number; None stands for the only layout."""
         # The compiler fuses this gather with later gathers, so no environment has its own copy of the tables.
         return self.tables if layout is None else jax.tree.map(lambda leaf: jnp.asarray(leaf)[layout], self.tables)
 

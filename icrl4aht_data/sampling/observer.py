@@ -13,7 +13,7 @@ from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.selection import Selection
 
-_STEPS = 8192  # steps per thread rendered at a time if there are several layouts, which keeps temporary copies small
+_STEPS = 8192  # number of steps that a thread renders at once with several layouts; limits temporary memory
 
 
 class ArraySpec(NamedTuple):
@@ -66,11 +66,11 @@ class Observer:
         return np.empty((*out.shape[:-3], *self._record_shape), np.uint8) if self._renders else out
 
     def observe(self, histories: np.ndarray, records: np.ndarray, out: np.ndarray) -> None:
-        """Render the egos' observations, unless the records were read directly into `out`.
+        """Write the egos' observations to `out`; do nothing if the records were read directly into `out`.
 
         Args:
             histories: int (B,), positions in the selection.
-            records: the filled array from `records`, uint8 (B, ..., *R).
+            records: uint8 (B, ..., *R), the array that the method `records` returned, now filled with records.
             out: (B, ..., 5, 5, C), float32 or uint8, C-contiguous.
         """
         threads = self._selection.threads

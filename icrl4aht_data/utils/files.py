@@ -74,7 +74,7 @@ def read_lines(path: Path) -> Iterator[str]:
 
 @contextmanager
 def wrap_read_errors(path: Path) -> Iterator[None]:
-    """Raise errors of reading a file as `IndexFormatError` with the file's name.
+    """Convert errors of reading a file to `IndexFormatError`, whose message has the file's name.
 
     Raises:
         IndexFormatError: if the file is missing, cannot be read, or is not UTF-8.
@@ -131,7 +131,11 @@ def checked_hash(path: Path) -> str:
 
 
 def have_hashes(folder: Path, files: Mapping[str, str]) -> bool:
-    """Return whether all files of a folder (path -> SHA-256) have the given hashes.
+    """Return whether the listed files of a folder have the listed SHA-256 hashes.
+
+    Args:
+        folder: the folder that contains the files.
+        files: SHA-256 of each file, by path in the folder.
 
     Raises:
         OSError: if a file cannot be read.
@@ -151,7 +155,7 @@ def json_hash(content: Any) -> str:
 
 @contextmanager
 def add_filename(path: Path) -> Iterator[None]:
-    """Add the file's name to an OSError without a file name, which operations on open files raise."""
+    """Set the file name of an OSError that has none, such as an error of an operation on an open file."""
     try:
         yield
     except OSError as error:
@@ -190,13 +194,16 @@ def sync(path: Path) -> None:
 
 
 def final_name(name: str) -> str:
-    """Return the final path of a temporary file of `atomic_write` or of a lock; other paths are unchanged."""
+    """Return `NAME` for a temporary file `.NAME.partial` or a lock file `.NAME.lock`; other paths are unchanged."""
     return re.sub(r"(^|/)\.([^/]+)\.(partial|lock)$", r"\1\2", name)
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield a temporary path to write to, then sync and rename the file to `path`, which an error leaves unchanged."""
+    """Yield a temporary path to write to, then sync the file and rename it to `path`.
+
+    If an error is raised, the file at `path` is unchanged.
+    """
     partial = path.with_name(f".{path.name}.partial")
     partial.unlink(missing_ok=True)  # otherwise writing would follow a symbolic link
     try:
@@ -281,12 +288,12 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
         try:
             yield
         finally:
-            with suppress(OSError):  # Windows cannot remove an open file: there, `FileLock` removes the file
+            with suppress(OSError):  # Windows cannot remove an open file; on Windows, `FileLock` removes the lock file
                 path.unlink()
 
 
 def lock_path(folder: Path) -> Path:
-    """Return the path of a folder's lock file, next to the folder, which can be renamed or removed while locked."""
+    """Return the path of a folder's lock file, which is next to the folder, so that a locked folder can be renamed."""
     return folder.with_name(f".{folder.name}.lock")
 
 
@@ -297,14 +304,14 @@ _PART_BYTES = 200  # maximum bytes of a path component; temporary files have lon
 
 def files_below(folder: Path) -> Iterator[str]:
     """Yield the relative paths of all files below a folder; symbolic links are not followed."""
-    folders = [""]  # stack; `os.walk` fails on folders deeper than Python's recursion limit
+    folders = [""]  # no `os.walk`, which in Python 3.11 fails on folders deeper than the recursion limit
     while folders:
         prefix = folders.pop()
         try:
             with os.scandir(folder / prefix) as found:
                 entries = [(prefix + entry.name, entry.is_dir(follow_symlinks=False)) for entry in found]
         except OSError:
-            if prefix:  # a folder that cannot be listed is yielded itself
+            if prefix:  # yield the path of a folder that cannot be listed
                 yield prefix
             continue
         for name, is_folder in entries:
@@ -325,9 +332,9 @@ def is_safe_path(name: str) -> bool:
 
 
 def resolve_inside(folder: Path, name: str) -> Path:
-    """Return the path of a release's file after checking that it is inside the release.
+    """Return the path of a file of a release after checking that the file is inside the release.
 
-    Links from a snapshot folder of the Hub's cache to its blobs are allowed.
+    In the cache of the Hugging Face Hub, links from a snapshot folder to the folder of blobs are allowed.
 
     Raises:
         UnsafePathError: if the path points outside the release, or to neither a file nor a folder.
@@ -373,7 +380,7 @@ def describe_disk(path: Path) -> str:
 
 @contextmanager
 def explain_full_disk(target: Path) -> Iterator[None]:
-    """Raise an OSError of a full disk as `DiskFullError`, with the file or folder, the disk and its free space.
+    """Convert an OSError of a full disk to `DiskFullError`, whose message has `target`, the disk and its free space.
 
     Raises:
         DiskFullError: if the disk is full.

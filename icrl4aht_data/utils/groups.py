@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
-    """Return lists of items with equal keys, by key; items keep their order, keys are in order of first appearance."""
+    """Return a list of items for each key. Items keep their order, and keys are in order of first appearance."""
     groups: dict[K, list[T]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)

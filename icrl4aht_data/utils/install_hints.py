@@ -36,7 +36,7 @@ RESTORE = f"pip install --force-reinstall --no-deps {PACKAGE}, or in a checkout 
 
 
 def project_url() -> str | None:
-    """Return the address of the repository, `Repository` in pyproject.toml; None if no address is given there."""
+    """Return the address of the repository, `Repository` in pyproject.toml; None if the address is unknown."""
     with suppress(PackageNotFoundError):  # raised if the sources are not installed as a package
         urls = dict(line.split(", ", 1) for line in metadata(PACKAGE).get_all("Project-URL") or [])
         return urls.get("Repository")

@@ -56,7 +56,7 @@ class Option(NamedTuple):
 
 @cache
 def _hints_with(kind: type, *parts: Any) -> dict[str, Any]:
-    """Return the annotations of those fields of a dataclass that have a part of one of the given kinds, by name."""
+    """Return the annotations of a dataclass that contain one of the given types, such as `Option`, by field name."""
     hints = get_type_hints(kind, include_extras=True)
     return {
         name: hint
@@ -66,7 +66,7 @@ def _hints_with(kind: type, *parts: Any) -> dict[str, Any]:
 
 
 def option_hints(kind: type) -> dict[str, Any]:
-    """Return the annotations of those fields of a dataclass that are options, by field name."""
+    """Return the annotations of a dataclass that contain an `Option`, by field name."""
     return _hints_with(kind, Option)
 
 
@@ -214,6 +214,6 @@ def check_position(sequence: str, position: Any, count: int) -> int:
     if (number := _as_int(position)) is None:
         raise PositionTypeError(f"position {position!r} of {sequence}: expected an integer or a slice")
     if not -count <= number < count:
-        within = f"a number from {-count} to {count - 1}" if count else "no position, as it is empty"
+        within = f"a number from {-count} to {count - 1}" if count else "no position, because there are no items"
         raise PositionError(f"position {number} of {sequence}: expected {within}")
     return number

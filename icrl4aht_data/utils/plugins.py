@@ -86,12 +86,13 @@ class Plugins:
         for point in sorted(entry_points(group=self.group), key=lambda one: one.name):
             where = f"package {_package_id(point)}, entry point {self.group}: {point.name}"
             if not re.fullmatch("[A-Za-z][A-Za-z0-9_-]*", point.name):
-                raise PluginError(f"{where}: expected a name of letters, digits, _ and -: rename it")
+                raise PluginError(f"{where}: expected a name of letters, digits, _ and -: rename the entry point")
             if point.name in self._own:
-                raise PluginError(f"{where}: {PACKAGE} itself uses this name: rename it, or uninstall the package")
+                remedy = f"rename the entry point, or uninstall {_package_id(point)}"
+                raise PluginError(f"{where}: {PACKAGE} itself uses this name: {remedy}")
             if point.name in found:
                 other = _package_id(found[point.name])
-                raise PluginError(f"{where}: package {other} also registers this name: uninstall one of them")
+                raise PluginError(f"{where}: package {other} also registers this name: uninstall one package")
             found[point.name] = point
         return found
 

@@ -73,7 +73,7 @@ def _printed_lines(bars: Progress, unit: str, of_bytes: bool) -> Iterator[None]:
         while not stopped.wait(seconds):
             for task in bars.tasks:
                 if task.total and not task.finished:
-                    # Rich flushes after every call, so that a log shows the line at once.
+                    # Rich flushes after every call, so a log file contains the line at once.
                     bars.console.print(Text(progress_line(task, unit, of_bytes)), soft_wrap=True)
             seconds = LINE_SECONDS
 

@@ -1,1 +1,1 @@
-"""Writing of releases, and conversion between the formats of releases and of other files."""
+"""Writing of releases, and conversion of releases to and from other file formats."""

@@ -64,7 +64,7 @@ HEADROOM_PROTOCOL = "published"
 CURVES_FIGURE, LAYOUTS_FIGURE = (f"figures/{name}.png" for name in ("learning_curves", "layouts"))
 """Paths of the figures of a release built for publication."""
 
-_LEAST_RISE = 5.0  # a history counts as rising if its return rises by a quarter of a delivery
+_LEAST_RISE = 5.0  # a history counts as rising if its return rises by this much, a quarter of the reward for a delivery
 _MIXED, _WATCHING = "heuristic mixed with random actions", "heuristic that never acts"
 _SCHEDULE = {"histories", "episodes", "start", "end", "begin", "finish", "power"}
 
@@ -124,7 +124,7 @@ def teammate_name(task: Task) -> str:
 
 
 def benchmark_test_layouts(layouts: Iterable[str]) -> list[str]:
-    """Return the layouts of the benchmark that models trained on `layouts` are tested on."""
+    """Return the benchmark's test layouts for models that were trained on `layouts`."""
     names, tested = list(layouts), list[str]()
     for track, splits in TRACKS.items():
         own = [name for name in names if track_of(name) == track]
@@ -262,7 +262,7 @@ def _learning_rows(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> li
 
 
 def _curve_rows(learning: Iterable[Mapping[str, Any]], sources: Iterable[str]) -> list[list[str]]:
-    """Return the rows of the card's table of learning curves, with a row per layout and split, a column per source."""
+    """Return the card's table of learning curves as rows: one row per layout and split, one column per source."""
     found = defaultdict[tuple[str, str], dict[str, str]](dict)
     for row in learning:
         text = f"{row['first']:z.1f} to {row['last']:z.1f} ({row['histories']})"
@@ -420,11 +420,11 @@ def _distinct_values(tasks: Iterable[_TaskFacts], name: str) -> list[Any]:
 
 
 def _generation_facts(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
-    """Return how the histories were generated: egos, stream filters, noise schedules, versions."""
+    """Return how the histories were generated: egos, filters of histories, noise schedules, versions."""
     noise = {json.dumps([task.made.source, task.made.noise]): task.made for task in tasks if task.made.noise}
     labels = {"profile": "profile", "code_version": "icrl4aht-data", "jax_version": "JAX", "platform": "platform"}
     versions = {label: ", ".join(map(str, _distinct_values(tasks, name))) for name, label in labels.items()}
-    # Names of the layouts by settings of the stream filter.
+    # names of layouts, by settings of the filter that selected their histories
     streams = defaultdict[tuple[int, int, float | None], list[str]](list)
     for task in tasks:
         made = task.made
@@ -441,7 +441,7 @@ def _generation_facts(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
 
 
 def print_learning(content: Mapping[str, Any], console: Console) -> None:
-    """Print a dataset card's table of learning curves, and the tasks without histories in the release.
+    """Print a dataset card's table of learning curves, and the tasks that were left out of the release.
 
     Args:
         content: result of `card_facts`.

@@ -28,7 +28,8 @@ def combine_releases(
 
     Args:
         target: the folder to write.
-        roots: releases of the same kind and episode length without common tasks; a `Dataset` selects a part of one.
+        roots: releases of the same kind and episode length without common tasks; a `Dataset` may be a selection of
+            histories.
         data_version: version of the new release; by default the common version of the releases.
         overwrite: whether to replace a release at `target`.
 

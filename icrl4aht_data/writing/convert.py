@@ -19,7 +19,7 @@ HistoryProgress = Callable[[int, int], None]
 
 
 def release_tasks(dataset: Dataset) -> Mapping[str, Task]:
-    """Return the tasks of a dataset by id; a `NamedTask` from each index entry if the release stores no tasks."""
+    """Return the tasks of a dataset by id; if the release stores no tasks, a `NamedTask` for each id in the index."""
     return dataset.tasks or {entry.task_id: named_task(entry.to_json()) for entry in dataset.entries}
 
 

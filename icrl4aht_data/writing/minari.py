@@ -50,7 +50,7 @@ def to_minari(
     """Write a selection as a Minari dataset, which `minari.load_dataset(target.name)` opens in MINARI_DATASETS_PATH.
 
     Observations have the layouts' own channels if all layouts have the same number of channels, else the canonical
-    channels. If there is one task with one heuristic teammate, Minari's `recover_environment` makes its environment.
+    channels. For one task with one heuristic teammate, Minari's `recover_environment` makes the task's environment.
 
     Args:
         dataset: a release with state records, or a selection of its histories.

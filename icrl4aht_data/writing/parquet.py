@@ -45,7 +45,7 @@ def to_parquet(dataset: Dataset, path: str | Path, *, overwrite: bool = False) -
     schema = index_schema().with_metadata({"icrl4aht-data": "index"})
     rows = arrow.Table.from_pylist([entry.to_row() for entry in dataset.entries], schema)
     with explain_full_disk(path), atomic_write(path) as partial, partial.open("wb") as stream:
-        pq.write_table(rows, stream)  # a stream instead of a path, since pyarrow leaves its file open after an error
+        pq.write_table(rows, stream)  # given a path, pyarrow would leave the file open after an error
     return path
 
 
@@ -59,7 +59,7 @@ def write_episodes(
     """Write Parquet files `<layout>/<split>-00000-of-00001.parquet` with one row per episode.
 
     Only one history and one row group are in memory at a time. All episodes of a history are in one file, in order. The
-    columns are `arrow_tables.EPISODE_COLUMNS`; state records are padded to the longest of the selection's layouts.
+    columns are `arrow_tables.EPISODE_COLUMNS`; state records are padded to the longest record of the selection.
 
     Args:
         dataset: a release with state records, or a selection of its histories.

@@ -1,4 +1,4 @@
-"""Returns of models that were trained only on one release, for the dataset card of this release.
+"""Mean returns of models that were trained on one release only, for the dataset card of this release.
 
 `icrl4aht-data research proof` measures the returns on validation tasks and stores them in `cards/proof.json`.
 """

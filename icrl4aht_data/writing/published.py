@@ -177,8 +177,9 @@ def from_published(
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`.
-        PublishedFormatError: if a file is missing or malformed, if a group has no array that the kind of release
-            needs, or if two histories have the same group or stream; the message has the file and the group.
+        PublishedFormatError: if a file is missing or malformed, if an array that the kind of release needs is
+            missing from a group, or if two histories have the same group, or the same task and `env_idx`; the message
+            has the file and the group.
     """
     kept_steps, source = check_int("kept_steps", kept_steps, 1), as_path(source)
     lines = read_published_index(resolve_inside(source, HISTORIES_INDEX))
@@ -231,7 +232,7 @@ def _wrap_errors(what: str) -> Iterator[None]:
 
 
 def _with_padding_note(provenance: Provenance, history: _PublishedHistory) -> Provenance:
-    """Return provenance with a note about padded views if the history's observations have to be padded."""
+    """Return the provenance, and add a note about padding if the history's observations will be padded."""
     if not (history.needs_padding and history.kind == OBSERVATIONS):
         return provenance
     rows = get_layout(history.line["layout"]).height
@@ -300,7 +301,7 @@ class _PublishedHistory:
         return has_missing_rows(get_layout(self.line["layout"]), self.line["obs_shape"])
 
     def field_names(self) -> list[str]:
-        """Return the names of the arrays of this history to convert."""
+        """Return the names of the arrays to convert."""
         fields = memory_fields(self.kind)
         return [f.name for f in fields if self.kind not in f.optional or self.line.get(f"has_{f.name}")]
 
@@ -337,7 +338,8 @@ class _PublishedHistory:
         if name == "dones" and not (array.any() and np.array_equal(array, episode_ends(steps, self.kept_steps))):
             raise PublishedFormatError(
                 f"{self.where}: dones: expected an episode end every {self.kept_steps} steps, found {array.sum()} in "
-                f"{steps} steps, first at {np.flatnonzero(array)[:3].tolist()}; give the length with --kept-steps"
+                f"{steps} steps, first at {np.flatnonzero(array)[:3].tolist()}; give the steps "
+                f"of an episode with --kept-steps"
             )
         if name == "state":
             obs, shown = self._read_recorded("obs"), np.empty((steps, *layout.obs_shape), np.uint8)

@@ -46,8 +46,8 @@ def read_published_index(path: Path) -> list[dict[str, Any]]:
         The lines of the index, as dicts.
 
     Raises:
-        PublishedFormatError: if a field is missing or invalid, or if two lines have the same group, or the same stream
-            of a task; the message has the line number.
+        PublishedFormatError: if a field is missing or invalid, or if two lines have the same group, or the same task
+            and `env_idx`; the message has the line number.
     """
     lines: list[dict[str, Any]] = []
     seen: dict[Any, int] = {}

@@ -1,4 +1,4 @@
-"""Padding of observations of the published code, which have too few rows on maps with fewer than 5 rows.
+"""Padding of the published code's observations, which have fewer than 5 rows on maps with fewer than 5 rows.
 
 On such a map, a published observation has only as many rows as the map: 4 x 5 cells on the cramped layouts. The missing
 row is two cells below the agent. The padding is 0 outside the map. Inside the map the padding shows the fixed cells
@@ -25,12 +25,12 @@ PADDING = (
 
 
 def has_missing_rows(layout: Layout, obs_shape: tuple[int, ...]) -> bool:
-    """Return whether observations of this shape have fewer than 5 rows, as on a map with fewer than 5 rows."""
+    """Return whether `obs_shape` has only the rows of the layout's map, and the map has fewer than 5 rows."""
     return layout.height < WINDOW and tuple(obs_shape) == (layout.height, *layout.obs_shape[1:])
 
 
 def empty_views(layout: Layout) -> np.ndarray:
-    """Return the observations from each cell that the ego can reach, without items, uint8 (cells, 5, 5, C)."""
+    """Return the observation of a map without items from each cell that the ego can reach, uint8 (cells, 5, 5, C)."""
     records = np.zeros((len(layout.rooms[EGO]), record_size(layout)), np.uint8)
     records[:, columns(layout).positions] = layout.rooms[EGO][:, None]
     return np.asarray(observe(layout, records, EGO))
@@ -55,7 +55,8 @@ def complete_views(layout: Layout, short: np.ndarray) -> np.ndarray:
     at = np.array([cells.get(view.tobytes(), -1) for view in np.ascontiguousarray(short[..., fixed])], np.int64)
     if (at < 0).any():
         raise PublishedFormatError(
-            f"the observation of step {int(np.argmin(at))} matches {layout.name} from no cell that the ego can reach"
+            f"the observation of step {int(np.argmin(at))} does not match {layout.name} from any cell that the ego can "
+            f"reach"
         )
     full = np.zeros((len(short), *layout.obs_shape), np.uint8)
     full[:, :rows] = short

@@ -57,7 +57,7 @@ class NewHistory:
     """One history to write to a release.
 
     Args:
-        env_idx: number of the environment stream within the learner's parallel rollout, or of a noise history.
+        env_idx: number of the environment in the learner's parallel rollout; without a learner, number of the history.
         arrays: arrays by field name, for the fields `schema.memory_fields` of the release's kind; for a full release,
             `obs` is rendered from the states.
         learner: number of the independent learner that made the history, counted from 0.
@@ -150,8 +150,8 @@ def write_release(
     named = [task.task.task_id for task in new if isinstance(task.task, NamedTask)]
     if named and (kind in KINDS or len(named) < len(ids)):
         raise OptionError(
-            f"{len(named)} of {len(ids)} tasks, such as {named[0]!r}, are known by name only: give all tasks, or give "
-            f"none in a release of {OBSERVATIONS}"
+            f"{len(named)} of {len(ids)} tasks, such as {named[0]!r}, have only names: give complete tasks, or in a "
+            f"release of {OBSERVATIONS} nothing but named tasks"
         )
     with atomic_folder(target, overwrite=overwrite, sources=sources) as root:
         writer = _ShardWriter(root, kind, kept_steps, shard_histories, done)
@@ -228,7 +228,7 @@ class _ShardWriter:
         """Return the index entry of a history; the history's id and position in a shard are not set yet."""
         arrays, task = history.arrays, new.task
         if not 0 <= history.env_idx < 2**63:
-            raise OptionError(f"task {task.task_id}: env_idx: expected a stream number from 0, found {history.env_idx}")
+            raise OptionError(f"task {task.task_id}: env_idx: expected a number from 0, found {history.env_idx}")
         if not 0 <= history.learner < (learners := new.provenance.learners or 1):
             raise OptionError(
                 f"task {task.task_id}: learner: expected 0 to {learners - 1}, since provenance has {learners} "

@@ -27,7 +27,7 @@ _CONVERTED = (
 
 
 def as_path(target: object) -> Path:
-    """Return the path of a folder or file to write as a `Path`.
+    """Return the given path of an output folder or file as a `Path`.
 
     Raises:
         OptionError: if the argument is neither a path nor a string.
@@ -101,7 +101,7 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
         return False
     if not overwrite:
         raise OptionError(f"{target}: exists; give another folder, or use --overwrite to replace it")
-    if fault := _foreign_content(resolved):
+    if fault := _refusal_reason(resolved):
         raise OptionError(
             f"{target} {fault}; --overwrite replaces only releases and converted files: remove the folder, or give "
             f"another folder"
@@ -109,8 +109,8 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
     return True
 
 
-def _foreign_content(folder: Path) -> str | None:
-    """Return text that says why a folder was not written by this package; None if it was."""
+def _refusal_reason(folder: Path) -> str | None:
+    """Return why a folder may not be replaced, such as "is not a folder"; None if this package wrote the folder."""
     if not folder.is_dir():
         return "is not a folder"
     present = set(files_below(folder))

@@ -103,7 +103,7 @@ def _checksums(data: bytes) -> tuple[int, np.ndarray]:
 
 
 def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Sequence[Entry]) -> None:
-    """Create the empty datasets of a group, with shape (T,) for one history, (histories, T) for stacked histories."""
+    """Create the empty datasets of a group, of shape (rows,) for one history or (histories, rows) if stacked."""
     first = entries[0]
     group = file.create_group(first.h5_group)
     for field in first.stored_fields(kind):

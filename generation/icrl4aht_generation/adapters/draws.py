@@ -22,9 +22,9 @@ from icrl4aht_generation.profiles import Work
 def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[str, Any]:
     """Return options of `TaskEnv.reset` that repeat all random draws of a recorded episode.
 
-    Unlike the options of `Dataset.reset_options`, these do not replay the teammate's actions: the teammate's policy
-    acts with the recorded random draws, and reacts if the ego acts differently. A learned teammate's network may round
-    differently on another machine; heuristics play exactly as recorded.
+    Unlike the options of `Dataset.reset_options`, the returned options do not replay the teammate's actions: the
+    teammate's policy acts with the recorded random draws, and reacts if the ego acts differently. A learned teammate's
+    network may round differently on another machine; heuristics play exactly as recorded.
 
     Args:
         dataset: a release that this version of the code generated.
@@ -42,14 +42,14 @@ def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[
     entry = dataset.index.entry(history_id)
     task, number = dataset.history_task(history_id), episode
     ego = dataset.provenance.get(task.task_id, Provenance()).ego
-    if entry.source in SCRIPTED_SOURCES:  # every scripted episode is the first of a new environment
+    if entry.source in SCRIPTED_SOURCES:  # every scripted episode is episode 0 of a new environment
         key, number = scripted_episode_keys(task.seed, np.array([entry.env_idx]), np.array([episode]))[0], 0
     elif entry.source == "ppo" and ego is not None:
         key = stream_keys(learner_key(Work(task, learner=entry.learner)), ego["environments"])[entry.env_idx]
     else:
         raise NotStoredError(
-            f"{dataset.root}: history {history_id}, source {entry.source}: the release does not record its random "
-            f"keys; use dataset.reset_options, which needs no keys"
+            f"{dataset.root}: history {history_id}, source {entry.source}: the release does not record the history's "
+            f"random keys; use dataset.reset_options, which needs no keys"
         )
     env = Environment(task.layout)
     drawn = np.asarray(env.first_record(key[None], jnp.array([number])))[0]

@@ -50,7 +50,7 @@ RESET_OPTIONS = ("state", "key", "episode", "teammate_actions", "recipes")
 class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
     """Environment of the ego in a task; the task's teammate acts inside the environment.
 
-    Observation: uint8 (5, 5, C), what the ego sees, as `icrl4aht_data.overcooked.observe.observe` describes.
+    Observation: uint8 (5, 5, C), what the ego sees; see `icrl4aht_data.overcooked.observe.observe`.
     Action: 0..5 (up, down, left, right, stay, interact).
     Reward: the team's reward, without shaping.
     End: the environment never ends an episode. `gymnasium.make` adds a limit of 100 steps, or `max_episode_steps`.
@@ -147,7 +147,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         """Play one step with the ego's action 0..5; the teammate's policy chooses the teammate's action.
 
         Returns:
-            Observation, reward, terminated (False), truncated (False) and `info`, as the class describes.
+            Observation, reward, terminated (False), truncated (False) and `info`; see the class.
 
         Raises:
             OptionError: if `reset` was not called before, or the action does not exist.

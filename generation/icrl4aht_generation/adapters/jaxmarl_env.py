@@ -1,4 +1,4 @@
-"""The environment of a layout with JaxMARL's interface."""
+"""JaxMARL's interface to the environment of a layout."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class JaxMARLEnv(MultiAgentEnv):
     """Environment of a layout for JaxMARL's learners and wrappers, which choose the actions of both agents.
 
     Agents: "agent_0", the ego, and "agent_1", the teammate.
-    Observation: uint8 (5, 5, C) of each agent, as `icrl4aht_data.overcooked.observe.observe_both` describes.
+    Observation: uint8 (5, 5, C) of each agent; see `icrl4aht_data.overcooked.observe.observe_both`.
     Action: 0..5 of each agent (up, down, left, right, stay, interact), which is not JaxMARL's order.
     Reward: float32, the team's reward, equal for both agents.
     End: both agents are `done` after `max_steps` steps; `step` then starts the next episode, as usual in JaxMARL.

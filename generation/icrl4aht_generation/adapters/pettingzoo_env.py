@@ -1,4 +1,4 @@
-"""The environment of a layout with PettingZoo's parallel interface, for policies of both agents."""
+"""PettingZoo's parallel interface to the environment of a layout, for policies of both agents."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ AGENT_NAMES = ("ego", "teammate")
 
 
 class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
-    """Environment of a layout with actions for both agents, for self-play and cross-play.
+    """Environment of a layout in which callers choose the actions of both agents, for self-play and cross-play.
 
     Agents: "ego" and "teammate", with equal spaces. If walls divide the layout, each agent starts on its own side.
-    Observation: uint8 (5, 5, C) of each agent, as `icrl4aht_data.overcooked.observe.observe_both` describes.
+    Observation: uint8 (5, 5, C) of each agent; see `icrl4aht_data.overcooked.observe.observe_both`.
     Action: 0..5 of each agent (up, down, left, right, stay, interact).
     Reward: the team's reward without shaping, equal for both agents.
     End: both agents are truncated after `max_steps` steps.
@@ -123,7 +123,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         """Play one step with an action 0..5 of each agent.
 
         Returns:
-            Observations, rewards, terminations, truncations and infos of both agents, as the class describes.
+            Observations, rewards, terminations, truncations and infos of both agents; see the class.
 
         Raises:
             OptionError: if no episode is running, or an action is missing or does not exist.

@@ -25,10 +25,10 @@ from icrl4aht_generation.policy import Policy
 
 
 def stream_returns(rewards: np.ndarray) -> np.ndarray:
-    """Return the episode returns of N streams, float64 (N, E), over the stored steps of each episode.
+    """Return the episode returns in N environments, float64 (N, E), summed over the stored steps of each episode.
 
     Args:
-        rewards: rewards of N streams, int8 (N, T).
+        rewards: rewards in N environments, int8 (N, T).
     """
     return rewards.reshape(len(rewards), -1, KEPT_STEPS).sum(axis=-1, dtype=np.float64)
 
@@ -36,10 +36,10 @@ def stream_returns(rewards: np.ndarray) -> np.ndarray:
 def select_streams(
     returns: Sequence[np.ndarray], keep: int, least_improvement: float | None = None
 ) -> list[np.ndarray]:
-    """Select up to `keep` streams with the highest final return plus improvement from all learners of a task together.
+    """Select up to `keep` streams of the learners of a task, by the highest sum of final return and improvement.
 
-    Learners take turns: in each round every learner adds its next best stream, and the learner with the best stream of
-    the round comes first.
+    Each stream is the history of one environment. Learners take turns: in each round every learner adds its next best
+    stream, and the learner with the best stream of the round comes first.
 
     Args:
         returns: for each learner (N, E), episode returns of its streams.
@@ -62,7 +62,7 @@ def select_streams(
 
 
 def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: float | None = None) -> StreamFilter:
-    """Return the mean initial and final return of all streams and of the selected streams.
+    """Return the mean initial and final return of all streams (histories of environments), and of selected streams.
 
     Args:
         before: (N, E), episode returns of all streams.
@@ -77,36 +77,36 @@ def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: floa
 
 
 def relabel(layout: Layout, network: ActorCritic, params: Any, states: np.ndarray) -> np.ndarray:
-    """Return a policy's most probable action at every step of a stream, int8 (T,).
+    """Return a policy's most probable action at every step of a history, int8 (T,).
 
     The recurrent state is zero at the start of each episode, as in training.
 
     Args:
-        layout: layout of the stream.
+        layout: layout of the history.
         network: the ego's network.
         params: parameters of the checkpoint that chooses the actions.
-        states: state records of the stream, uint8 (T, S).
+        states: state records of the history, uint8 (T, S).
     """
     return _by_step(_compiled_greedy(layout, network.widths)(params, _by_episode(states)))
 
 
 def oracle_labels(layout: Layout, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Return the scripted oracle's action at every step of a stream, int8 (T,).
+    """Return the scripted oracle's action at every step of a history, int8 (T,).
 
     The oracle follows every episode from its first step: it remembers the recorded states and the actions that the ego
     took, and chooses its own action at each state.
 
     Args:
-        layout: layout of the stream.
-        states: state records of the stream, uint8 (T, S).
+        layout: layout of the history.
+        states: state records of the history, uint8 (T, S).
         actions: the ego's actions, int8 (T,).
     """
     return _by_step(_compiled_oracle(layout)(_by_episode(states), _by_episode(actions)))
 
 
-def _by_episode(stream: np.ndarray) -> jax.Array:
-    """Reshape a stream (T, ...) to (100, E, ...), with the step of the episode as first axis."""
-    return jnp.asarray(stream.reshape(-1, KEPT_STEPS, *stream.shape[1:]).swapaxes(0, 1))
+def _by_episode(history: np.ndarray) -> jax.Array:
+    """Reshape an array (T, ...) of a history to (100, E, ...), with the step of the episode as first axis."""
+    return jnp.asarray(history.reshape(-1, KEPT_STEPS, *history.shape[1:]).swapaxes(0, 1))
 
 
 def _by_step(labels: jax.Array) -> np.ndarray:
@@ -143,21 +143,21 @@ def follow_script(
     numbers: jax.Array | None = None,
     memory: Any = None,
 ) -> tuple[jax.Array, Any]:
-    """Return the actions that a script would take in each state of episodes that another ego played, and its memory.
+    """Return a script's actions in the states of episodes that another ego played, and the script's memory.
 
     Args:
-        script: the oracle or the searcher.
+        script: policy from `oracle` or `searcher`.
         layout: one layout or several.
         records: uint8 (T, E, S), state records of E episodes.
         taken: int (T, E), the actions that the ego took.
         numbers: int (E,), index of each episode's layout; None for one layout.
-        memory: memory of the script before the episodes, leaves (E, ...); by default that before its first episode.
+        memory: memory of the script before the episodes, leaves (E, ...); by default the initial memory.
 
     Returns:
-        The script's actions, int32 (T, E), and its memory after the episodes.
+        The script's actions, int32 (T, E), and the script's memory after the episodes.
     """
     env = Environment(layout)
-    keys = jax.random.split(jax.random.key(0), records.shape[1])  # the scripts draw numbers only in their first memory
+    keys = jax.random.split(jax.random.key(0), records.shape[1])  # the scripts only draw their initial memory at random
     zero = jnp.zeros(len(keys), jnp.int32)
 
     def step(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:

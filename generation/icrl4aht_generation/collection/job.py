@@ -1,4 +1,4 @@
-"""Jobs of a queue that generate the histories of tasks."""
+"""Jobs that generate the histories of tasks, to be run by a queue."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ def play_scripted_histories(
 
 
 def scripted_episode_keys(seed: int, history: np.ndarray, episode: np.ndarray) -> Key[Array, " M"]:
-    """Return the environment keys of the given episodes of a task; every episode is the first of its environment.
+    """Return the environment keys of the given episodes of a task; every episode starts in a new environment.
 
     Args:
         seed: the task's seed.
@@ -146,9 +146,10 @@ def _episode_keys(key: Key[Array, ""], history: Any, episode: Any) -> Key[Array,
 
 @lru_cache(maxsize=64)
 def _compiled_play(teammate: Policy, searches: bool) -> Callable[..., tuple[dict[str, Array], Any]]:
-    """Return a compiled function that plays a batch of episodes and returns the searcher's memories after them.
+    """Return a compiled function that plays a batch of episodes.
 
-    The function ignores the given memories in the first episode of a history.
+    The function returns the arrays of the episodes, and the script's memories if `searches` is true, else None.
+    It ignores the given memories in the first episode of a history.
     """
     script = SITUATION_SEARCHER if searches else SITUATION_ORACLE
 
@@ -182,7 +183,7 @@ def _compiled_play(teammate: Policy, searches: bool) -> Callable[..., tuple[dict
 
 
 def _blank_memories(params: Any, count: int) -> Any:
-    """Return `count` memories of the searcher, filled with zeros."""
+    """Return `count` memories of the policy `SITUATION_SEARCHER`, filled with zeros."""
     shape = jax.eval_shape(SITUATION_SEARCHER.init, params, jax.random.key(0))
     return jax.tree.map(lambda leaf: np.zeros((count, *leaf.shape), leaf.dtype), shape)
 

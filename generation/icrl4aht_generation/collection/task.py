@@ -1,7 +1,8 @@
 """Generate the artefact of a task with source `ppo`: train an ego and record its histories.
 
-The learner's state is saved at intervals, after the histories recorded so far. A killed task resumes from the last
-save. Every update is a pure function of the state, so the artefact is identical to that of an uninterrupted run.
+At intervals, the recorded histories are written to the disk, and then the learner's state is saved. A killed task
+resumes from the last save. Every update is a pure function of the state, so the artefact is identical to that of an
+uninterrupted run.
 """
 
 from __future__ import annotations
@@ -84,6 +85,6 @@ def saved_progress(saved: StateFile) -> int:
 
 
 def learner_key(work: Work) -> Any:
-    """Return the typed JAX key of a learner; learners of a task have independent keys, derived from its seed."""
+    """Return the typed JAX key of a learner; learners of a task have independent keys, derived from the task's seed."""
     key = jax.random.key(work.task.seed)
     return jax.random.fold_in(key, work.learner) if work.learner else key

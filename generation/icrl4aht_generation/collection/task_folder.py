@@ -264,7 +264,7 @@ class ArrayWriter:
 
     @contextmanager
     def recording(self) -> Iterator[None]:
-        """Context manager that adds the time inside it to the seconds spent on recording."""
+        """Add the duration of the `with` block to the seconds spent on recording."""
         began = time.perf_counter()
         yield
         self._recording += time.perf_counter() - began

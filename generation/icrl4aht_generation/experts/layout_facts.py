@@ -135,7 +135,7 @@ def _shortest_walks(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
     for action in range(4):
         end = ends[..., action]
         faced = layout.ahead[end, FACING_OF[action]].astype(int)
-        # Turns and moves are handled apart, because each makes the agent face a given cell from at most one cell.
+        # Turns and moves are separate assignments, so no cell of `ways` occurs twice in one assignment.
         for walks in (False, True):
             obstacle, start = np.nonzero((end != room) == walks)
             own = obstacle[:, None], room, faced[obstacle, start][:, None]

@@ -1,4 +1,4 @@
-"""Scripted ego that sees the complete state, to estimate how much an ego can earn beyond one that never moves.
+"""Scripted ego that sees the complete state. Its returns show how much more an ego can earn than one that never moves.
 
 The oracle is agent 0 and deterministic. It fills one pot at a time with the ingredients that the recipe still needs,
 fetches a plate in time for the soup, and delivers only soups of the current recipe; other soups wait on a counter.
@@ -219,7 +219,10 @@ class OracleView:
 
     @cached_property
     def spoiled_pots(self) -> Bool[Array, " P"]:
-        """Partly filled pots whose contents fit no recipe; if no pot is left, the ego fills up and empties one."""
+        """Partly filled pots whose contents fit no recipe that the ego should cook.
+
+        The mask is empty if the ego cannot serve, and while a soup of the current recipe is in stock.
+        """
         nowhere = self.facts.pots & ~self.full & (self.contents > 0) & (jnp.min(self.plan_costs, axis=1) == NEVER)
         return nowhere & (self.stock[0] == 0) & self.facts.serves
 
@@ -230,7 +233,7 @@ class OracleView:
 
     @cached_property
     def teammate_pots(self) -> Bool[Array, " P"]:
-        """Pots that the ego leaves to the teammate: the pot that is first to have a soup of the current recipe.
+        """Pots that the ego leaves to the teammate: at most the pot whose soup of the current recipe is done first.
 
         The ego leaves no pot to a teammate that does not cook or is idle.
         """
@@ -382,7 +385,7 @@ def _ingredient_subgoals(view: OracleView) -> list[Subgoal]:
     return [
         # Put the ingredient into the pot with the lowest cost of walking and cooking.
         Subgoal(holds, view.cost_at_pots(plans < NEVER, plans)),
-        # Fill up a spoiled pot, because only the soup of a full pot can be taken out.
+        # Fill up a pot whose contents fit no recipe, because only the soup of a full pot can be taken out.
         Subgoal(holds & ~jnp.any(fits), view.cost_at_pots(view.spoiled_pots)),
         # Wait at the pot, because only the teammate serves.
         Subgoal(holds & ~view.facts.serves, view.cost_at_pots(view.full | view.mate_delivers)),
@@ -421,7 +424,7 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
         jnp.any(scene.ingredient_counts(view.recipes) > 0, axis=0), to_pot[:, jnp.argmax(facts.pots)]
     )
     return [
-        # Fill up a pot that needs few steps before fetching a plate.
+        # Before fetching a plate, fill up a pot that needs few steps.
         Subgoal(builds & quick & ~view.risky, ingredients),
         # Fetch a plate in time for a soup of the current recipe.
         plate_subgoal(right & due),
@@ -433,7 +436,7 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
         plate_subgoal(right),
         # Empty a pot that blocks the current recipe.
         plate_subgoal(wrong),
-        # Fill up a spoiled pot.
+        # Fill up a pot whose contents fit no recipe.
         Subgoal(empty & jnp.any(view.spoiled_pots), any_ingredient),
         # An ego that only fills pots holds an ingredient ready for the next soup.
         Subgoal(empty & (jnp.any(view.full) | view.mate_delivers) & ~facts.serves, any_ingredient),

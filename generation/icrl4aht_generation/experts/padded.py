@@ -66,7 +66,7 @@ def _pad_to_largest(layout: Layout, others: tuple[Layout, ...]) -> PaddedLayout:
 
 @lru_cache(maxsize=8)
 def largest_layouts(layouts: tuple[Layout, ...]) -> list[Layout]:
-    """Return layouts that together have the largest size of every axis of the tables and of `LayoutFacts`."""
+    """Return layouts that include a largest layout along every axis of the tables and of `LayoutFacts`."""
     if not layouts:
         return []
     sizes = np.array([_axis_sizes(layout) for layout in layouts])

@@ -1,13 +1,13 @@
 """Scripted ego that finds out which dish its teammate wants: it tries dishes, and repeats the dish that was rewarded.
 
-The searcher plays like the oracle, but cooks a believed recipe instead of the current recipe. It remembers over the
-episodes of a task which dishes earned no reward (refused) and which dish was rewarded (paid). Before any reward, the
-searcher believes in the dish that best fits the ingredients that the teammate has put into pots, and breaks ties at
-random. The belief changes only while nothing is being cooked. This ego is for tasks that reward only one dish in all
-episodes, see `Task.recipes`.
+This ego, called the searcher, plays like the oracle, but cooks a believed recipe instead of the current recipe. It
+remembers over the episodes of a task which dishes earned no reward (refused) and which dish was rewarded (paid). Before
+any reward, the searcher believes in the dish that best fits the ingredients that the teammate has put into pots, and
+breaks ties at random. The belief changes only while nothing is being cooked. This ego is for tasks that reward only one
+dish in all episodes, see `Task.recipes`.
 
-The searcher can also advise another ego that acts in its place, so that this ego learns to search. Its belief then also
-follows the dish that the ego has begun, because an unrefused dish is as good a try as the searcher's own.
+The searcher can also advise another ego, which acts and learns to imitate the advice. The searcher then prefers to
+believe in a dish that the acting ego has begun, because any dish that was not refused is worth trying.
 
 Shapes: `D` dishes that can be made of the layout's ingredients, `S` bytes of a state record.
 """
@@ -39,7 +39,7 @@ MOST_DISHES = 10
 
 
 class SearchMemory(NamedTuple):
-    """Memory of the searcher, which lasts from one episode to the next.
+    """Memory of the policy from `searcher`, which lasts from one episode to the next.
 
     Attributes:
         oracle: memory of the oracle; its record has the believed recipe.
@@ -59,11 +59,11 @@ class SearchMemory(NamedTuple):
 
 
 def searcher(layouts: Layout | Sequence[Layout], advises: bool = False) -> Policy:
-    """Return the searcher, a scripted ego.
+    """Return a scripted ego that tries dishes to find out which dish its teammate wants.
 
     Args:
         layouts: one layout, or several layouts in the environment's order.
-        advises: whether another ego acts in the searcher's place.
+        advises: whether another ego acts, while this script only proposes an action in every step.
     """
     known = [layouts] if isinstance(layouts, Layout) else list(layouts)
     script = _ADVISING_SEARCHER if advises else SITUATION_SEARCHER
@@ -80,7 +80,7 @@ def padded_dishes(layouts: Sequence[Layout]) -> np.ndarray:
 
 
 def with_taken_action(memory: OracleMemory | SearchMemory, action: Int[Array, "*B"]) -> Any:
-    """Return the memory of a scripted ego after a step in which the executed action was not its own choice."""
+    """Return a scripted ego's memory with the executed action, which may differ from the script's choice."""
     if isinstance(memory, SearchMemory):
         return memory._replace(oracle=memory.oracle._replace(action=action))
     return memory._replace(action=action)
@@ -116,7 +116,7 @@ _ADVISING_SEARCHER = Policy((), _initial_memory, partial(_act, advises=True), "s
 def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"], advises: bool) -> SearchMemory:
     """Return the memory updated by the outcome of the previous step."""
     new, old = unpack(view.tables, view.record), unpack(view.tables, memory.oracle.record)
-    # `follows` is False at an episode's first step, because new starts are rarely one move from the last positions.
+    # At an episode's first step, `follows` is almost always False: few starts are one move from the last positions.
     moves = jnp.asarray(view.tables.moves)[old.positions.astype(jnp.int32)]
     follows = jnp.all(jnp.any(moves == new.positions[:, None], axis=1))
     ahead = jnp.asarray(view.tables.ahead)[old.positions.astype(jnp.int32), old.facings.astype(jnp.int32)]
@@ -138,7 +138,7 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
     change = idle | refused[memory.belief] | paid.any()
     if advises:
         fitting = jnp.all(Scene.ingredient_counts(dishes) >= _begun_dish(new), axis=-1)
-        score = score - 50.0 * ~fitting  # counts more than the teammate's hints, and less than what was paid or refused
+        score = score - 50.0 * ~fitting  # weighs more than the teammate's ingredients, less than a reward or refusal
         change |= ~fitting[memory.belief]
     belief = jnp.where(change, score.argmax(), memory.belief)
     return memory._replace(paid=paid, refused=refused, seen=seen, belief=belief)
@@ -147,7 +147,7 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
 def _begun_dish(state: State) -> Int[Array, " 3"]:
     """Return the number of pieces of each ingredient in the soup that the ego carries.
 
-    If it carries no soup, count the fullest pot and the ingredient in the ego's hand, if that pot has room for it.
+    If the ego carries no soup, count the ingredients in the fullest pot, and in the ego's hand if the pot has room.
     """
     hand, counts = state.hands[EGO], ingredient_count(state.pot_items)
     in_hand = Scene.ingredient_counts(hand)

@@ -1,1 +1,1 @@
-"""A queue of long jobs that run in local processes or with Ray, such as tasks, populations and best responses."""
+"""A queue of long jobs, such as tasks, populations and best responses, that run in local processes or with Ray."""

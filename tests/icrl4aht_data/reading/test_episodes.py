@@ -59,7 +59,7 @@ class TestEpisodes:
         assert issubclass(PositionError, IndexError) and issubclass(PositionTypeError, TypeError)
         with pytest.raises(PositionTypeError, match=r"position 'a' of Episodes.*: expected an integer or a slice"):
             episodes["a"]  # type: ignore[call-overload]
-        with pytest.raises(PositionError, match="expected no position, as it is empty"):
+        with pytest.raises(PositionError, match="expected no position, because there are no items"):
             episodes[:0][0]
         with pytest.raises(PositionError, match="position 99 of the selection's histories: expected a number from -12"):
             dataset[99]

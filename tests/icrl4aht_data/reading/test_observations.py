@@ -300,5 +300,5 @@ def test_combine_accepts_releases_of_observations(converted_release, published_f
         old = before[history.entry.task_id, history.entry.env_idx]
         np.testing.assert_array_equal(history.obs[:], old.obs[:])
         np.testing.assert_array_equal(history.actions[:], old.actions[:])
-    with pytest.raises(OptionError, match=r"3 of 7 tasks, such as 'task_a', are known by name only: give all"):
+    with pytest.raises(OptionError, match=r"3 of 7 tasks, such as 'task_a', have only names: give complete"):
         combine_releases(tmp_path / "mixed", [reconverted_release, converted_release])

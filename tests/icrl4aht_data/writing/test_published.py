@@ -119,7 +119,7 @@ def test_short_views_that_match_no_position_are_refused(short_views, tmp_path):
         stored: Any = file["/1/obs"]
         stored[7] = 0
     with pytest.raises(
-        PublishedFormatError, match="group /1: obs: the observation of step 7 matches cramped_up from no cell"
+        PublishedFormatError, match="group /1: obs: the observation of step 7 does not match cramped_up from any cell"
     ):
         from_published(tmp_path / "files", tmp_path / "out", kept_steps=20)
 
