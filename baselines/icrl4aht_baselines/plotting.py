@@ -16,8 +16,8 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
     """Plot the numbers of a run's metrics.jsonl over the training steps, in at most `MOST_PANELS` panels.
 
     Each logged number has a panel with a line for each part of the data. Returns have a panel for each layout, with a
-    line for each kind of teammate and a shared axis. Thick lines are running means over a twentieth of the points;
-    thin lines connect the points.
+    line for each kind of teammate; these panels have equal limits. Thick lines are running means over a twentieth of
+    the points; thin lines connect the points.
     """
     lines = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines()]
     numbers = pd.DataFrame(lines).melt(["step", "part"], var_name="panel", value_name="number").dropna()

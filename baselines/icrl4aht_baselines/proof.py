@@ -1,4 +1,4 @@
-"""Proof that models learn from a release: training on its histories alone, and returns on validation tasks.
+"""Show what models learn from a release: train models on its histories alone, and play validation tasks.
 
     OUT/SOURCE-LEARNER-sSEED/run         run folder of a training job
     OUT/SOURCE-LEARNER-sSEED/results     results on the sets of validation tasks, with memory and without
@@ -68,13 +68,13 @@ LEARNERS = {
 """Name on the command line and in folders -> learner."""
 
 _MODEL = ModelOptions(**{**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0})
-# The script `search` finds out which dish is wanted in its first episodes, so models train on these.
+# Within its first episodes, the script `search` finds out which dish is wanted, so models train on these episodes.
 _FIRST_EPISODES = 5
 _TRAINING: dict[str, Any] = {"learning_rate": 2e-3, "validate_every": 10**6, "save_every": 10**6, "log_every": 20}
 
 
 def proof_tasks() -> dict[str, tuple[Task, ...]]:
-    """Return the validation tasks of the track preference, and those of the track teammate that have headroom."""
+    """Return name of a track -> validation tasks: all tasks of `preference`, and tasks with headroom of `teammate`."""
     played = [*bundled_tasks(TEAMMATE_TRACK, "validation"), *bundled_tasks(TEAMMATE_TRACK, "diverse")]
     return {
         PREFERENCE: tuple(bundled_tasks(PREFERENCE, "validation")),
@@ -84,14 +84,14 @@ def proof_tasks() -> dict[str, tuple[Task, ...]]:
 
 @dataclass(frozen=True)
 class ProofOptions:
-    """Settings that all training jobs of the proof share.
+    """Settings that all training jobs of `research proof` share.
 
     Attributes:
         root: folder or address of a release; None for the bundled release.
         steps: number of training steps; with the defaults, a job takes about 35 minutes on a core.
         batch_size: number of windows or contexts in a batch.
         context: K, steps of a window or transitions of a context.
-        tasks: name of a set -> its tasks; by default the validation tasks of two tracks that have headroom.
+        tasks: name of a set -> its tasks; by default the validation tasks that `proof_tasks` returns.
     """
 
     root: str | None = None
@@ -167,7 +167,7 @@ class ProofJob(TrainingJob):
 
 
 def _training_seconds(timing: Path) -> float:
-    """Return the duration of a training run in seconds, from its timing log, which also covers resumed parts."""
+    """Return the seconds that all steps of a training run took, from the timing log; steps before a resume count."""
     lines = [parse_json(line) for line in read_text(timing).splitlines()]
     steps = np.diff([0, *(line["step"] for line in lines)])
     return float(np.sum(steps / [line["steps_per_second"] for line in lines]))

@@ -87,7 +87,7 @@ def no_change() -> ViewChange:
 
 
 def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> BatchView:
-    """Return a function from a batch of state records to observations that are mirrored or have hidden indicators.
+    """Return a function from a batch of state records to observations, possibly mirrored or with hidden indicators.
 
     The layout number of a batch row is n + N * m, for layout n of N layouts and mirroring m: 0 for none, 1 for upside
     down, 2 for sideways, 3 for both.
@@ -136,7 +136,7 @@ class NumberedBatches:
         numbers = self._numbers[np.zeros(rows, np.int32) if batch.layouts is None else batch.layouts]
         if not self._layouts:
             return batch._replace(layouts=numbers)
-        # The mirroring depends only on the seed, the batch number and the process, as the batch does.
+        # Like the batch itself, the mirroring depends only on the seed, the batch number and the process.
         drawn = np.random.default_rng((self._sampler.seed, i, self._sampler.process_index))
         mirroring = drawn.integers(4, size=rows, dtype=np.int32)
         actions = {
@@ -144,7 +144,8 @@ class NumberedBatches:
             for name, values in batch._asdict().items()
             if values is not None and (name.endswith("actions") or name == "query_target")
         }
-        if hasattr(batch, "is_first"):  # values before a task's first step stay 0, as in acting
+        if hasattr(batch, "is_first"):
+            # At a task's first step and in padding, previous actions are fillers, which stay 0.
             filler = batch.is_first | ~batch.attention_mask
             actions |= {name: np.where(filler, 0, actions[name]) for name in actions if name.startswith("prev_")}
         return batch._replace(**actions, layouts=numbers + self._layouts * mirroring)

@@ -1,1 +1,1 @@
-"""Training by playing (RL^2, best responses), and recording of histories of trained agents."""
+"""Train agents by playing (RL^2, best responses), and record histories that trained agents play."""

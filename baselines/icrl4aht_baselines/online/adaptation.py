@@ -74,20 +74,20 @@ class HeadroomJob(EgoJob):
         return {"tasks_hash": tasks, "kind": self.kind, **super().settings}
 
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
-        """Train the ego. Return the `returns`: task id -> mean return with sampled actions in new episodes."""
-        trainer, params = self.train(self._play_tasks(), on_update)
+        """Train the ego. Return {"returns": task id -> mean return in new episodes with sampled actions}."""
+        trainer, params = self.train(self._parallel_tasks(), on_update)
         returns = trainer.measure(params, MEASURED_EPISODES, _MEASURE_SEED).mean(axis=1)
         ids = np.array([task.id for task in trainer.tasks])
         return {"returns": {one.task_id: round(float(returns[ids == one.task_id].mean()), 3) for one in self.tasks}}
 
-    def _play_tasks(self) -> list[PlayTask]:
+    def _parallel_tasks(self) -> list[PlayTask]:
         """Return the tasks that are played in parallel, in which each of `tasks` appears about equally often."""
         of_kind = grouped(self.tasks, lambda task: task.teammate_kind)
         several = {kind for kind, own in of_kind.items() if len({task.layout for task in own}) > 1}
         different, entries = [], with_equal_parameters([task.teammate for task in self.tasks])
         for number, (task, entry) in enumerate(zip(self.tasks, entries, strict=True)):
             kind, partner = task.teammate_kind, number if self.kind == "informed" else None
-            # Heuristics for several layouts are built without a layout, so that one program plays on all of them.
+            # A kind of heuristic on several layouts is built without a layout, so that one program covers all of them.
             mate = build_teammate(None if kind in several else task.layout, entry)
             different.append(PlayTask(task.layout, kind, mate, False, self.title, partner, task.task_id))
         return [different[played % len(different)] for played in range(self.options.tasks)]
@@ -106,7 +106,7 @@ def headroom_jobs(
 
 
 def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | None:
-    """Return the entry of a set of tasks for cards/adaptation.json; None if no seed has finished both kinds of ego.
+    """Return the entry of a set of tasks for cards/adaptation.json; None if no seed has finished jobs of both kinds.
 
     An entry has the training steps, the width of the network, the mean return of each kind of ego for each seed,
     and the mean return on each layout over these seeds.

@@ -1,6 +1,6 @@
-"""Recording of histories of source `agent`: a trained agent plays with a release's teammates, and steps get labels.
+"""Record histories of source `agent`: a trained agent plays with a release's teammates, and its steps are labelled.
 
-The agent's memory lasts for a history, as it lasts for a task in an evaluation. The probability of a random action may
+The agent keeps its memory during a history, like during a task in an evaluation. The probability of a random action may
 fall over a history's episodes, as in noise distillation (Zisman et al. 2024). `expert_actions` are the agent's choices
 before the noise, or those of another trained agent that observes the same history, as in on-policy imitation (DAgger,
 Ross et al. 2011). `oracle_actions` are those of the scripted oracle. The teammate may change within a history, as under
@@ -200,7 +200,7 @@ def plan_swaps(tasks: Sequence[Task], episodes: int, every: int) -> dict[str, Te
         every: number of episodes after which the next teammate plays.
 
     Raises:
-        OptionError: if no teammate would change, because histories are too short or no task has another one.
+        OptionError: if `every` is not between 1 and `episodes` - 1, or no task has another teammate to swap with.
     """
     if not 0 < every < episodes:
         raise OptionError(f"swap = {every}: expected 1 to {episodes - 1}, since a history has {episodes} episodes")
@@ -216,8 +216,8 @@ def plan_swaps(tasks: Sequence[Task], episodes: int, every: int) -> dict[str, Te
             found[task.task_id] = TeammateSwaps(every, in_turn[: -(-episodes // every)])
     if not found:
         raise OptionError(
-            f"swap = {every}: none of the {len(tasks)} tasks, such as {tasks[0].task_id}, has another teammate of its "
-            f"kind, split and layout to swap with: select more histories, or give a --manifest"
+            f"swap = {every}: expected at least 2 teammates of the same kind, split and layout, found 1, as in "
+            f"{tasks[0].task_id}; select more histories, or give a --manifest"
         )
     return found
 

@@ -52,14 +52,14 @@ def prepare_play(
     histories: HistoryOptions,
     tasks: Sequence[Task] = (),
 ) -> TrainingTask:
-    """Return the training task of a method that plays with the teammates of a release's histories and of other tasks.
+    """Return a `TrainingTask` for a method that plays with teammates from a release's histories and from other tasks.
 
     Args:
         name: name of the method.
         model: architecture of the model.
         options: options of the training; `batch_size` is the number of tasks that are played in parallel.
         play: hyper-parameters of playing and learning.
-        histories: choice of the histories that state the layouts and teammates to play with.
+        histories: choice of histories, which determine the layouts and teammates to play with.
         tasks: tasks with additional heuristic teammates; tasks on other layouts are left out.
 
     Raises:
@@ -79,13 +79,13 @@ def prepare_play(
     groups = _task_groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
     # With few tasks, some teammates are in no group, so the record of training data must not state them.
     fixed = {layout for layout, _ in teammates if _fixes_dish(layout)}
-    # The model imitates the searcher if it cannot see which dish is wanted.
+    # In tasks with a fixed dish that no indicator shows, the model imitates the script `search`.
     played = [
         task._replace(searched=task.layout in fixed and (task.hidden or not task.layout.shows_recipe))
         for group in groups
         for task in group
     ]
-    # The searcher counts as the oracle, because it is an oracle with a belief about the recipe.
+    # Actions of the script `search` also count as "oracle", because `search` is an oracle that believes in a recipe.
     labels: Labels | None = "oracle" if play.imitation else None
     about = {
         "model": asdict(model),
@@ -112,9 +112,9 @@ def _check_unused(name: str, histories: HistoryOptions) -> None:
     for field in ("order", "queries", "labels", "every", "held_out"):
         found = getattr(histories, field)
         if found != getattr(default, field):
-            raise OptionError(f"{field} = {found}: {name} learns by playing, not from histories; leave it out")
+            raise OptionError(f"{field} = {found}: {name} learns by playing, not from histories; leave out this option")
     if histories.channels == "own":
-        raise OptionError(f"channels = own: {name} takes canonical channels; leave it out")
+        raise OptionError(f"channels = own: {name} takes canonical channels; leave out this option")
 
 
 def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple[Dataset, Dataset | None, list[Layout]]:
@@ -134,7 +134,7 @@ def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple
 
 
 def _task_teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
-    """Return the teammates of the tasks in a selection of histories, and of additional tasks."""
+    """Return the teammates in a selection of histories and in additional tasks."""
     found: _Teammates = {}
     scripted = [(task.layout, task.task_id, task.teammate) for task in tasks]
     if dataset is not None:
@@ -161,7 +161,7 @@ def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
     missing = [layout.name for layout in layouts if layout.name not in known]
     if missing:
         raise OptionError(
-            f"{', '.join(missing)}: no chosen history and no task of a manifest is on such a layout; choose other "
+            f"{', '.join(missing)}: no chosen history and no task of a manifest is on these layouts; choose other "
             f"layouts, filters or manifests"
         )
 
@@ -169,7 +169,7 @@ def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
 def _task_groups(
     teammates: _Teammates, shares: Mapping[str, float], hidden: Sequence[str], play: PlayOptions, tasks: int
 ) -> list[list[PlayTask]]:
-    """Return the groups of training tasks, including other versions of the layouts if `play` requests them.
+    """Return groups of training tasks, also on other versions of the layouts if `play` requests such versions.
 
     Args:
         teammates: the training teammates.
@@ -179,7 +179,7 @@ def _task_groups(
         tasks: total number of tasks.
 
     Raises:
-        OptionError: if other versions are requested and a layout's teammates cannot play them.
+        OptionError: if other versions are requested, but a layout's teammates cannot play on them.
     """
     heuristics = _heuristic_teammates(teammates) if play.four_recipes or play.rearranged else {}
     everywhere, shares, hidden = dict(teammates), dict(shares), list(hidden)
@@ -188,7 +188,7 @@ def _task_groups(
             other, (kind, mates) = with_four_recipes(layout), next(iter(kinds.items()))
             everywhere[other, kind] = mates
             shares[other.name] = FOUR_RECIPES_SHARE
-            # The version has another name, so its indicator must be hidden by that name as well.
+            # Indicators are hidden by the name of the layout, and this version of the layout has another name.
             hidden += [other.name] * (layout.name in hidden)
     # Rearranged versions get a fixed part of the tasks; the other layouts divide the rest by their shares.
     total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
@@ -202,7 +202,7 @@ def _task_groups(
 
 
 def _fixes_dish(layout: Layout) -> bool:
-    """Return whether the recipes of a layout are replaced by one dish, the only rewarded dish in all episodes."""
+    """Return whether a single dish replaces the layout's recipes, so that no other dish is ever rewarded."""
     return len(layout.recipes) == 1 and layout.recipes != get_layout(layout.name).recipes
 
 

@@ -96,7 +96,7 @@ def find_behaviours(tasks: Iterable[Task]) -> list[tuple[Task, ...]]:
 def tasks_with_headroom(tasks: Iterable[Task]) -> list[Task]:
     """Return the tasks in which the scripted oracle earns more than `stay`, according to stored measurements.
 
-    Tasks without a measurement, such as those of the track preference, are included.
+    Tasks without a measurement, such as those of the track `preference`, are included.
     """
     cells = read_headroom(PROTOCOL)
     kept = []
@@ -271,10 +271,10 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainedRespo
 
 
 def include_models(found: BestResponse, models: Mapping[str, Mapping[str, float]]) -> BestResponse:
-    """Return a best response in which the best of some models replaces the trained ego, if the model earns more.
+    """Return a best response, with the best of some models in place of the trained ego if this model earns more.
 
     Args:
-        found: best response that was trained.
+        found: best response with a trained ego.
         models: model -> task id -> mean return; models without results in all tasks of `found` are ignored.
     """
     earned = {
@@ -318,8 +318,8 @@ def write_responses(
 def responses_table(folder: Path) -> str:
     """Return a Markdown table of a folder's best responses.
 
-    Column "B" is the best return. Column "rise" is the `slope` of the best training run: if the returns still rose by
-    several points, the training was too short.
+    Column "B" is the best return. Column "rise" is the `slope` of the best training run; a `slope` well above 0
+    shows that the training was too short.
     """
     body = []
     for one in read_best_responses(folder / RESPONSES_FILE).behaviours:

@@ -3,12 +3,12 @@
 A training step plays one or more episodes of every task, then updates the model on all of them. After these episodes, a
 task continues with the model's recurrent state, or ends at random; then a new task with the same teammate begins.
 Returns include the rewards of later episodes of the task, so exploration that helps later is rewarded. Gradients pass
-through all episodes of a step, so with several the model learns to remember what a later episode needs.
+through all episodes of a step, so with several episodes the model learns to remember what a later one needs.
 
 At first the model also imitates a script: the loss contains the cross-entropy of the script's actions in the states
 that the model visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al. 2011). The
-script is the oracle, which knows what the model has to find out. In tasks with a hidden dish, the script is the
-searcher, which finds out the dish over the episodes of a task.
+script is the oracle, which knows what the model has to find out. In tasks with a hidden dish, the script is
+`search`, which finds out the dish over the episodes of a task.
 
 Shapes: `B` tasks, `E` episodes of a step, `T` steps of all these episodes, `S` size of the recurrent state.
 """
@@ -60,7 +60,7 @@ class PlayerMemory(NamedTuple):
         state: float32 (S,), recurrent state of the model.
         started: bool (), whether a step of the task was played; if not, the outcome of the previous step is zero.
         partner: int32 (), number of the teammate for an informed model; None for other models.
-        searcher: memory of the searcher if the model imitates it; None otherwise.
+        searcher: memory of the script `search` if the model imitates this script; None otherwise.
     """
 
     change: ViewChange
@@ -97,7 +97,7 @@ class PlayTask(NamedTuple):
         label: name of the layout in the log.
         partner: number of the teammate, for an informed model; None for other models.
         id: id of the task that the teammate comes from; empty if it is not recorded.
-        searched: whether the model imitates the searcher instead of the oracle.
+        searched: whether the model imitates the script `search` instead of the oracle.
     """
 
     layout: Layout
@@ -111,7 +111,7 @@ class PlayTask(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name in the log of all tasks with this label and kind of teammate."""
+        """Log name that all tasks with this label and kind of teammate share."""
         return f"{self.label} {self.family}"
 
 
@@ -121,7 +121,9 @@ def make_groups(
     shares: Mapping[str, float],
     hidden: Collection[str] = (),
 ) -> list[list[PlayTask]]:
-    """Return groups of tasks: divided among layouts by their shares, and equally among a layout's kinds of teammates.
+    """Return groups of tasks.
+
+    Layouts get tasks in proportion to their shares; all kinds of teammates on a layout get equally many tasks.
 
     Args:
         teammates: (layout, kind of teammate) -> task id -> teammate; see `make_group` for the choice among them.
@@ -174,7 +176,7 @@ class _Network(NamedTuple):
 
 
 class _Player:
-    """Player of tasks in one compiled program, which requires that all teammates have the same functions."""
+    """Player of tasks in one compiled program; all teammates must have the same functions."""
 
     def __init__(self, tasks: Sequence[PlayTask], method: Method, play: PlayOptions, mirror: bool) -> None:
         self.tasks, self._method, self._play, self._mirror = tasks, method, play, mirror
@@ -202,11 +204,11 @@ class _Player:
         """Return the state before the first episode of all tasks."""
         env_key, change_key = jax.random.split(key)
         state = self.rollout.start(jax.random.split(env_key, len(self.tasks)))
-        change, searcher_memory = self._draw_change(change_key), self._new_searcher(key)
+        change, searcher_memory = self._draw_change(change_key), self._search_memory(key)
         return state._replace(ego=state.ego._replace(change=change, partner=self._partners, searcher=searcher_memory))
 
-    def _new_searcher(self, key: Key[Array, ""]) -> Any:
-        """Return the searcher's memory at the start of every task; None if the model imitates the oracle."""
+    def _search_memory(self, key: Key[Array, ""]) -> Any:
+        """Return the memory of `search` at the start of every task; None if the model imitates the oracle."""
         if not self._searched:
             return None
         keys = jax.random.split(jax.random.fold_in(key, 2), len(self.tasks))
@@ -243,7 +245,7 @@ class _Player:
             jnp.where(ended[:, None], 0.0, after.ego.state),
             ~ended,
             state.ego.partner,
-            select_rows(ended, self._new_searcher(key), after.ego.searcher),
+            select_rows(ended, self._search_memory(key), after.ego.searcher),
         )
         before = select_rows(ended, no_outcome(len(self.tasks)), after.before)
         return RolloutState(after.env, memory, before), sequences, returns
@@ -260,7 +262,7 @@ class _Player:
         env, change = self.rollout.env, state.ego.change
         record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))
         taken, theirs = actions[..., EGO], actions[..., TEAMMATE]
-        # The inputs include the step after the played ones, whose value bootstraps the return.
+        # The inputs also include the next step after the played steps; its value bootstraps the return.
         look = partial(observe, agent=EGO, canonical=True)
         seen_records = jnp.concatenate([played.record, after.env.record[:, None]], axis=1)
         steps = StepInput(
@@ -271,7 +273,7 @@ class _Player:
             partner=None if state.ego.partner is None else jnp.tile(state.ego.partner, (len(record) + 1, 1)),
         )
         if self._changes:
-            # Only the first of these steps can be the first step of a task.
+            # Only the first step of `steps` can be the first step of a task.
             started = jnp.ones((len(record) + 1, len(self.tasks)), bool).at[0].set(state.ego.started)
             steps = seen_steps(change, steps, started)
         # Log-probabilities and values are computed again with the operations of the loss, so that both agree exactly.
@@ -297,7 +299,7 @@ class _Player:
 
 
 def make_players(tasks: Sequence[PlayTask], method: Method, play: PlayOptions, mirror: bool) -> list[_Player]:
-    """Return the players, one for all tasks that can share a compiled program."""
+    """Return players; all tasks that can share a compiled program have the same player."""
 
     def program(task: PlayTask) -> tuple[Any, ...]:
         mate = task.teammate
@@ -308,10 +310,10 @@ def make_players(tasks: Sequence[PlayTask], method: Method, play: PlayOptions, m
 
 
 def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"]) -> StepInput:
-    """Return steps as they look to an ego with changed observations.
+    """Return steps with changed observations, and with previous actions converted to the changed view.
 
     Args:
-        change: changes of the observations (*B,), or of their last axes if they are equal in all steps.
+        change: changes of the observations, (*B,), or with only the last axes of *B if all steps have equal changes.
         steps: steps with the environment's observations (*B, ..).
         started: whether each step has a previous step in its task; if not, previous actions are fillers and stay 0.
     """
@@ -399,7 +401,7 @@ class PlayTrainer:
         return jax.jit(self._initial_state)()
 
     def state_like(self) -> Any:
-        """Return the shapes and dtypes of the state, which restoring a checkpoint needs."""
+        """Return the shapes and dtypes of the state, for restoring a checkpoint."""
         return jax.eval_shape(self._initial_state)
 
     def _initial_state(self) -> PlayState:
@@ -410,7 +412,7 @@ class PlayTrainer:
         return PlayState(params, ppo_optimizer(self.ppo.config).init(params), tasks, jnp.int32(0))
 
     def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 0) -> AbstractContextManager[range]:
-        """Return the numbers of the training steps, which replace batches: episodes are played in `step`."""
+        """Return the numbers of the training steps instead of batches, because `step` plays the episodes."""
         return nullcontext(range(start, stop))
 
     def validation_lines(self, state: PlayState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
@@ -428,16 +430,16 @@ class PlayTrainer:
             for program, player, tasks, key in zip(programs, self.players, state.tasks, keys, strict=True)
         ]
         tasks, sequences, returns = zip(*played, strict=True)
-        # Minibatches are sampled from all groups together, so that each one has many layouts.
         falling = jnp.maximum(0.0, 1.0 - state.step / (self.play.imitation_end * self.options.steps))
         weight = self.play.imitation * falling
+        # Minibatches are sampled from the tasks of all players together, so that a minibatch has many layouts.
         params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
         earned = jnp.concatenate(returns)
         log |= {f"return {name}": earned[rows].mean() for name, rows in self._rows.items()}
         return PlayState(params, optimizer, tasks, state.step + 1), log
 
     def measure(self, params: Any, episodes: int, seed: int) -> np.ndarray:
-        """Return the returns of sampled actions in new episodes of `self.tasks`, float64 (tasks, episodes).
+        """Play new episodes of `self.tasks` with sampled actions. Return their returns, float64 (tasks, episodes).
 
         Args:
             params: parameters of the model.

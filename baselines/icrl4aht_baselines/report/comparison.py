@@ -75,8 +75,8 @@ class StoredResults:
         """Return the results of each agent on the test tasks under the protocol of the page, in the order of `agents`.
 
         Args:
-            control: "cleared" or "swapped", see `protocols.CONTROLS`, or one of `OTHER_WAYS` of choosing actions; empty
-                for results without a control and in the agent's own way.
+            control: "cleared" or "swapped", see `protocols.CONTROLS`, or another play mode, see `OTHER_WAYS`; empty for
+                the agent's main results.
         """
         table = self.table
         chosen = (table["protocol"] == SUBMITTED_PROTOCOL) & (table["control"] == control) & (table["kind"] == "test")
@@ -84,7 +84,7 @@ class StoredResults:
         return {agent: returns_by_cell(found[agent]) for agent in [*self.agents] if agent in found}
 
     def with_other_play_modes(self, results: Mapping[str, AgentReturns]) -> dict[str, AgentReturns]:
-        """Return results of agents, each followed by those of its other play mode, such as "rl2 (greedy)"."""
+        """Return results; the results of an agent's other play mode, such as "rl2 (greedy)", follow the agent's own."""
         others, found = {way: self.returns(way) for way in OTHER_WAYS}, {}
         for agent, own in results.items():
             found[agent] = own
@@ -130,7 +130,7 @@ def write_stored(path: Path, stored: StoredResults) -> None:
 
 
 def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
-    """Check that a submission is an update if its agent is stored, and not an update otherwise.
+    """Check that `Submission.update` is set exactly if the submission's agent is already stored.
 
     Raises:
         OptionError: if `Submission.update` is set for an agent that is not stored, or not set for a stored agent.
@@ -234,7 +234,7 @@ def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], sca
     """Return table 1, with a row for each agent: training data, labels, budget, and scores on each track.
 
     An agent has a score on a track only if it played all layouts and families of the track that have headroom. Rows
-    such as "rl2 (greedy)", of an agent that chooses actions in its other way, have only scores.
+    of an agent's other play mode, such as "rl2 (greedy)", have only scores.
     """
     body = []
     for agent, cells in results.items():
@@ -267,7 +267,7 @@ def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 
 
 def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
-    """Return table 2: benefits M of memory and P of the right context, and mean returns in blocks of episodes.
+    """Return table 2: benefit M of memory, benefit P of the right context, and mean returns in blocks of episodes.
 
     The rows are those of table 1. Means are over the combinations of layout and family that have headroom, or over all
     that the agent played if none is known to have headroom. M and P are bold if they are above 0 with a p-value below
@@ -300,7 +300,7 @@ def _controlled_cells(cells: AgentReturns, scales: CellScales) -> list[ResultCel
 
 
 def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, str]:
-    """Return agent -> text with its score N on each track and its memory control M; a dash for missing values."""
+    """Return agent -> text with its score N on each track and its benefit M of memory; a dash for missing values."""
     scales, results, controls = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), stored.returns("cleared")
     found = {}
     for agent in agents:
@@ -315,7 +315,7 @@ def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, s
 
 
 def mean_best_return(layout: str, scales: CellScales) -> float | None:
-    """Return the mean return of the best responses to the families of a layout; None if no family has one.
+    """Return the mean return of the best responses to a layout's families; None if no family has a best response.
 
     For a family without a best response, the return of `stay` is used, because the oracle earns no more with this
     family, see `scores.cell_scales`.

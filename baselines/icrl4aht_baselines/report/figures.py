@@ -1,4 +1,4 @@
-"""Bar charts and panels of curves for the report's page, as numbers from which the page's template draws them.
+"""Bar charts and panels of curves for the report's page, as numbers that the page's template draws.
 
 Positions are in per cent of a chart's width and height, from its top left corner.
 """
@@ -78,7 +78,7 @@ class Chart(NamedTuple):
     Attributes:
         title: text above the figure.
         caption: text below the figure; may be empty.
-        series: number and label of each run in the figure; labels mark overlap of training data with the tasks.
+        series: number and label of each run in the figure; labels have symbols for overlap with training data.
         x_ticks: labelled positions on the horizontal axis.
         y_ticks: labelled positions on the vertical axis; empty for bars.
         bars: layout -> rows of bars.

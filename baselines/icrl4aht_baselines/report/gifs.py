@@ -116,7 +116,7 @@ def family_gifs(
 def _draw_result(run: EvaluationRun, cell: ResultCell, prefix: Path, suite: Path | None) -> EpisodePair:
     source, task = run.source(cell), run.tasks(cell)[0]
     protocol, seed = Protocol(**source.settings["protocol"]), source.settings["seeds"][0]
-    # Without a kind of tasks, "H1/t0" would mean a published test teammate.
+    # Titles name the kind of tasks, because "H1/t0" alone means a published test teammate.
     kind = "" if cell.kind == "test" else f" ({cell.kind})"
     title = f"{run.label} with {cell.family}/t{task.teammate['theta_id']}{kind} on {cell.layout}"
     origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}. {describe_overlap(run.overlaps([cell]))}"
@@ -132,10 +132,10 @@ def _draw_result(run: EvaluationRun, cell: ResultCell, prefix: Path, suite: Path
 
 
 def restore_ego(source: ResultSource) -> MakeEgo:
-    """Return the ego that earned some results, as a function from a layout to the ego's policy.
+    """Return the ego that was evaluated, as a function from a layout to the ego's policy.
 
     Raises:
-        OptionError: if the results are of no reference ego and no trained model, or the model is missing or has
+        OptionError: if the ego is neither a reference ego nor a trained model, or the model is missing or has
             changed.
     """
     name, details = source.settings["agent"], dict(source.settings.get("details", {}))

@@ -69,7 +69,7 @@ class TableScore(NamedTuple):
     """Results of an agent on a group of layouts and families, as one entry of a table.
 
     Attributes:
-        text: mean return, standard deviation, and marks for overlap with training data; a dash without results.
+        text: mean return, standard deviation, and symbols for overlap with training data; a dash without results.
         notes: further texts: missing results, the paper's numbers, score, and returns in blocks of episodes.
         is_flat: whether headroom was measured and none was found, see `scores.known_headroom`.
         overlaps: kinds of overlap of training data and tasks, see `icrl4aht_baselines.training.seen.OVERLAPS`.
@@ -90,7 +90,7 @@ def table_score(
         cells: layouts and families of the group.
         run: results of the agent; None without results.
         protocol: name of the protocol of the run.
-        published: the paper's mean and std; left out if not all of the group was played, or with other episode lengths.
+        published: the paper's mean and std; not shown next to incomplete results or other episode lengths.
     """
     played = [cell for cell in cells if run and cell in run.cells]
     headroom, scales = known_headroom(protocol), cell_scales(protocol)
@@ -211,7 +211,7 @@ def published_score(agent: EvaluationRun | str, cells: Sequence[ResultCell]) -> 
 
 
 def describe_conditions(runs: Iterable[EvaluationRun], cells: Container[ResultCell] | None = None) -> str:
-    """Return a sentence with the protocol, seeds, episodes and number of tasks of some runs, or of their `cells`.
+    """Return a sentence with the protocol, seeds, episodes and number of tasks of some runs, or of given `cells` only.
 
     If the conditions differ between runs, the sentence names the agents of each condition.
     """
@@ -257,7 +257,7 @@ def markdown(runs: Sequence[EvaluationRun]) -> str:
 
 
 def markdown_sections(runs: Sequence[EvaluationRun], protocol: str) -> list[str]:
-    """Return a Markdown section for each kind of tasks that was played: a table, and what the marks mean."""
+    """Return a Markdown section for each kind of tasks that was played: a table and its legend."""
     sections = []
     for table in returns_tables(runs, protocol):
         body = [
@@ -273,7 +273,7 @@ def markdown_sections(runs: Sequence[EvaluationRun], protocol: str) -> list[str]
 
 
 def summary_lines(runs: Sequence[EvaluationRun]) -> list[str]:
-    """Return the summary of some runs as lines of text, followed by the meaning of the marks."""
+    """Return the summary of some runs as lines of text, followed by a legend of the symbols for overlap."""
     headlines = [headline for run in runs for headline in find_headlines(run)]
     legend = overlap_legend({name for one in headlines for name in one.overlaps})
     return [*(headline.text for headline in headlines), *legend]
@@ -369,7 +369,7 @@ def _page_values(
 
 
 def _settings_table(runs: Sequence[EvaluationRun]) -> dict[str, list[str]]:
-    """Return name of a setting -> value for each source of results, for settings of evaluation and training."""
+    """Return name of a setting of evaluation or training -> its value in each source of results, as text."""
     columns = []
     for label, source in [(run.label, source) for run in runs for source in run.sources]:
         shown = {"agent": label, "layouts": ", ".join(source.layouts), "results": source.folder}

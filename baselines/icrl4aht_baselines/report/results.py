@@ -2,7 +2,7 @@
 
 A table of results is a data frame with a row for each task, seed and block of episodes:
 
-    agent, training         name of the agent; number of its training, if there are several with different seeds
+    agent, training         name of the agent; number of its training run, if there are several with different seeds
     protocol, control       name of the protocol; control, one of `protocols.CONTROLS`, or empty
     layout, family, kind    result cell of the task, see `ResultCell`
     overlap                 overlaps of training data and the cell's tasks, see `seen.OVERLAPS`
@@ -138,7 +138,7 @@ AgentReturns = Mapping[ResultCell, CellReturns]
 
 
 def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
-    """Convert a table with one agent, control and protocol to result cell -> returns, in the paper's order."""
+    """Return result cell -> returns, in the paper's order, from a table with one agent, control and protocol."""
     found = {}
     for key, rows in table.groupby(CELL_COLUMNS, sort=False):
         codes, axes = zip(*(pd.factorize(rows[name]) for name in ("training", "task", "seed", "block")), strict=True)
@@ -260,7 +260,7 @@ def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] = ()) -> None:
-    """Store the model's settings and the tasks in a folder of results, where reports need them.
+    """Store the model's settings and the evaluated tasks in a folder of results, for reports.
 
     Args:
         results: folder of the results.

@@ -100,9 +100,10 @@ def bundled_cells() -> dict[ResultCell, list[str]]:
 
 
 def behaviour_names() -> dict[str, str]:
-    """Return label of a task -> name of its teammate's behaviour, which is the id of the first task that has it.
+    """Return label of a task -> name of its teammate's behaviour.
 
-    The result covers the package's test tasks and all tasks with best responses.
+    The name of a behaviour is the id of the first task with this behaviour. The result covers the package's test tasks
+    and all tasks with best responses.
     """
     groups = [*same_behaviour_tasks(), *(best.tasks for best in best_responses().values())]
     return {task_label(task): group[0] for group in groups for task in group}
@@ -131,7 +132,7 @@ def add_scales(table: pd.DataFrame) -> pd.DataFrame:
     """Return a table of results with additional columns `stay` and `best`, the reference returns S and B of each task.
 
     Unknown values are empty. Under the control `swapped`, only the block of the last episodes has values, because
-    another teammate plays before. Under a protocol that swaps teammates, all values are empty.
+    another teammate plays the earlier episodes. Under a protocol that swaps teammates, all values are empty.
     """
     scaled = table.assign(stay=np.nan, best=np.nan)
     has_scale = (table["control"] != "swapped") | (table["block"] == "last 20")
@@ -213,7 +214,7 @@ def is_scored(returns: CellReturns | None, scale: CellScale | None) -> bool:
 
 
 def _gains_and_scales(returns: CellReturns, scale: CellScale) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Return R - S (T, U, S), B - S (U,), and the behaviours in the tasks that have best responses."""
+    """Return R - S (T, U, S), B - S (U,) and the teammates' behaviours, of the tasks with best responses."""
     known = [number for number, task in enumerate(returns.tasks) if task in scale.tasks]
     of_task = [scale.tasks[returns.tasks[number]] for number in known]
     stays, bests = (np.array([getattr(one, name) for one in of_task]) for name in ("stay", "best"))
@@ -249,7 +250,7 @@ def score_difference(
 def block_difference(
     one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], block: str
 ) -> MeanInterval | None:
-    """Return the mean of one agent's return minus another's over result cells, paired by task, seed and training run.
+    """Return the mean difference of two agents' returns over result cells, paired by task, seed and training run.
 
     Args:
         one: results of the first agent.
@@ -290,7 +291,7 @@ def scored_cells(run: EvaluationRun, cells: Iterable[ResultCell], scales: CellSc
 
 
 def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str]:
-    """Return two lines of text for each track: the benefits M of memory and P of the right context.
+    """Return two lines of text for each track: the benefit M of memory, and the benefit P of the right context.
 
     M and P are means over layouts and families with 95 % intervals. For the intervals, the teammates' behaviours are
     resampled within each layout and family, or the seeds if there is only one behaviour.
@@ -335,7 +336,7 @@ class Headline(NamedTuple):
     The numbers are of completely played result cells with headroom, or of all played cells if there are none.
 
     Attributes:
-        label: label of the run, with marks for overlap of its training data with the tasks.
+        label: label of the run, with symbols for overlap of its training data with the tasks.
         protocol: name of the protocol.
         tasks: text on the cells, such as "12 test cells with headroom, of 16 played".
         score: score of the agent; None without cells with headroom.

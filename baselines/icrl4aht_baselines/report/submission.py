@@ -40,7 +40,7 @@ _NAME = r"^[^\s`|]([^\n`|]*[^\s`|])?$"  # no characters that would break a Markd
 
 
 class AgentFacts(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    """Facts about an agent that the page of results states.
+    """Facts about an agent, for the page of results.
 
     Attributes:
         about: one sentence on how the agent was made.
@@ -84,7 +84,7 @@ class Submission(msgspec.Struct, forbid_unknown_fields=True):
     Attributes:
         format: version of this format.
         agent: name of the agent in tables.
-        facts: facts about the agent that the page states.
+        facts: facts about the agent, for the page.
         best_responses: version of the best responses, see `benchmark.best_responses`.
         tracks: names of the evaluated tracks.
         evaluations: results of the agent.
@@ -107,17 +107,17 @@ def submission_schema() -> str:
 
 
 def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "", update: bool = False) -> Submission:
-    """Make a submission from folders that `evaluate` made and their subfolders of controls, and check it.
+    """Make and check a submission, from folders that `evaluate` made and their subfolders with controls.
 
     Args:
-        folders: folders with results of one agent. Folders with the same tasks and play mode are of different
-            training runs, in this order. Controls of the agent's other play mode are left out.
-        facts: facts about the agent that the page states.
+        folders: folders with results of one agent. Folders with the same tasks and play mode count as
+            training runs 0, 1 and so on. Controls of the agent's other play mode are left out.
+        facts: facts about the agent, for the page.
         agent: name of the agent in tables; by default the name in the results.
         update: see `Submission`.
 
     Raises:
-        OptionError: for the reasons of `check_submission`, or if a folder has no results or results of other settings.
+        OptionError: for the reasons of `check_submission`, or if a folder's results are missing or differ in settings.
     """
     counts: Counter[tuple[str, str]] = Counter()  # (play mode, task) -> number of training runs so far
     evaluations, tasks, training, way = [], set(), 0, ""
@@ -183,7 +183,7 @@ def check_submission(found: Submission, where: str) -> None:
     if not found.update and not any(one.control == "" for one in found.evaluations):
         raise OptionError(
             f"{where}: expected results of the agent itself, found only controls or another play mode; give the "
-            f"folder of the agent's results as well, or --update if they are on the page"
+            f"folder of the agent's results as well, or --update if the page already has these results"
         )
 
 
@@ -193,8 +193,8 @@ def _check_name(found: Submission, where: str) -> None:
         raise OptionError(f"{where}: {found.agent} names a reference ego or a bundled model; give another --name")
     if not re.fullmatch(_NAME, found.agent) or found.agent.endswith(tuple(f" ({way})" for way in OTHER_WAYS)):
         raise OptionError(
-            f"{where}: agent {found.agent!r}: expected a name on one line without |, ` and outer spaces, and without a "
-            f"play mode at the end, which the settings state already; give another --name"
+            f"{where}: agent {found.agent!r}: expected one line without | and `, without spaces at its ends, and "
+            f"without a play mode at the end (the settings have it); give another --name"
         )
 
 
@@ -227,8 +227,8 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
     expected = {one.control} & {*CONTROLS}
     if marks != expected:
         raise OptionError(
-            f"{where}: results of {' and '.join(sorted(marks)) or 'no control'}, expected "
-            f"{''.join(expected) or 'no control'}; give the folder that `evaluate --controls` wrote"
+            f"{where}: found control {' and '.join(sorted(marks)) or 'none'}, expected "
+            f"{''.join(expected) or 'none'}; give the folder that `evaluate --controls` wrote"
         )
     if None in find_training_record(one.settings, where).values():
         raise OptionError(

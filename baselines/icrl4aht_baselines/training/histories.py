@@ -45,10 +45,10 @@ _CELL_FIELDS = {
 
 
 def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> TrainingTask:
-    """Return the training task of a method on histories; each of several processes gets its share of the batches.
+    """Return a `TrainingTask` for a method that learns from histories; each process reads its share of the batches.
 
-    The held-out part `teammates` consists of the release's validation histories on the training layouts that pass the
-    same filters. If there are none, some teammates of the training split are held out instead, see `hold_out`.
+    The held-out part `teammates` has the release's validation histories that are on the training layouts and pass the
+    filters. If there are none, some teammates of the training split are held out instead, see `hold_out`.
 
     Args:
         name: name of the method.
@@ -160,10 +160,10 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, Any]) -> Dataset:
 
     Raises:
         UnknownNameError: if a value exists neither in the release nor in the benchmark.
-        EmptySelectionError: if no history has one of the values, or no history passes all filters.
+        EmptySelectionError: if a value occurs in no history, or no history passes all filters.
     """
     for name, values in filters.items():
-        for value in values:  # a value without histories is an error, even if there are histories with the other values
+        for value in values:  # a value that occurs in no history is an error, even if other values occur
             dataset.filter(**{name: value})
     return dataset.filter(**filters)
 
@@ -171,9 +171,8 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, Any]) -> Dataset:
 def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[str, Any]]:
     """Return a record of training data: an entry for each layout, split, teammate family, algorithm and source.
 
-    An entry states these five values, the `labels` or None, the numbers of `tasks` and `histories`, `tasks_hash`, which
-    is a hash of the task ids, and `teammates`, the ids of the teammates, see `dataset.teammate_ids`, or None if the
-    release does not describe them.
+    An entry has these five values, `labels`, the numbers of `tasks` and `histories`, `tasks_hash` (hash of the task
+    ids), and `teammates` (their ids, see `dataset.teammate_ids`; None if the release does not describe teammates).
 
     Args:
         dataset: histories to train on, without held-out histories.
@@ -252,8 +251,8 @@ class HistorySplit(NamedTuple):
     Attributes:
         train: histories to train on.
         histories: held-out histories of the training tasks; None if each training task has only one history.
-        teammates: validation histories, or histories with held-out teammates; None if there are neither. No teammate is
-            in another part, but one with other parameters may behave the same.
+        teammates: validation histories, or histories with held-out teammates; None if there are neither. These
+            teammates are in no other part, but teammates with other parameters may behave the same.
     """
 
     train: Dataset
@@ -264,9 +263,9 @@ class HistorySplit(NamedTuple):
 def hold_out(dataset: Dataset, share: float = 0.1, validation: Dataset | None = None) -> HistorySplit:
     """Hold out a share of the teammates, and a share of the histories with the other teammates.
 
-    At least one teammate and one history are held out, but no history if each task has only one. Every task with a
-    teammate that is not held out keeps at least one training history. The choice depends on names only, see
-    `splitting`; `Dataset.split` makes the same choice.
+    At least one teammate is held out, unless there is only one teammate, and at least one history, unless each task has
+    only one history. Every task with a teammate that is not held out keeps a training history. The choice depends on
+    names only, see `splitting`; `Dataset.split` makes the same choice.
 
     Args:
         dataset: histories to divide.
@@ -321,7 +320,7 @@ class TrainedModel(NamedTuple):
 
 
 def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
-    """Return the parameters of a run as the start of a new run, and add the old run to the new run's settings.
+    """Return the parameters of an old run to start a new run with, and add the old run to the new run's settings.
 
     Args:
         run: run folder of the old run.
@@ -339,7 +338,7 @@ def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
             for name, one in ((config["method"], config), (method.name, about))
         )
         listed = "; ".join(f"{k} = {a!r}, not {b!r}" for k, (a, b) in differing_settings(found, expected).items())
-        raise OptionError(f"{run}: its parameters are of another model ({listed}); give these options, or another run")
+        raise OptionError(f"{run}: trained with other options ({listed}); give these options, or another run")
     about["init"] = {"run": before.hash, "step": before.step}
     about[TRAINED_ON] = [*about[TRAINED_ON], *(cell for cell in before.trained_on if cell not in about[TRAINED_ON])]
     return before.params

@@ -91,11 +91,11 @@ class TrainingJob(ABC):
         return None
 
     def runs(self) -> list[tuple[Path, int]]:
-        """Return the folders of the training runs, last one first, with the number of earlier training steps."""
+        """Return (folder, number of earlier training steps) of each training run, last run first."""
         return [(self.run_folder, 0)]
 
     def step_progress(self, on_update: OnUpdate, before: int = 0) -> StepProgress:
-        """Return a function for the trainer to report progress with, which calls `on_update`.
+        """Return a function that the trainer calls to report progress, and that calls `on_update`.
 
         Args:
             on_update: see `Job.run`.

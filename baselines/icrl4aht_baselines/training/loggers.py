@@ -70,7 +70,7 @@ def _wandb(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
 
 @contextmanager
 def _trackio(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
-    """Log to a Trackio database in the run's folder, or in the folder that `TRACKIO_DIR` or similar variables name."""
+    """Log to a Trackio database in the run's folder, or in the folder `TRACKIO_DIR` if this variable is set."""
     from huggingface_hub import constants
 
     wanted = os.environ.get("TRACKIO_DIR") or str(folder.absolute())

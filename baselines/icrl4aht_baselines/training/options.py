@@ -1,4 +1,4 @@
-"""Options of training and of the choice of histories; imports no JAX, so that help texts are printed quickly."""
+"""Options of training and of the choice of histories. The module does not import JAX, so help texts print quickly."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """Settings of a method that is trained by playing: one step plays `episodes` of each of `batch_size` tasks.
+    """Settings of a method that learns by playing: a step plays `batch_size` tasks, with `episodes` episodes of each.
 
     Raises:
         OptionError: if a value is out of bounds.

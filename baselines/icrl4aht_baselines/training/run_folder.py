@@ -65,8 +65,8 @@ def check_same_settings(found: dict[str, Any], expected: dict[str, Any], what: s
         OptionError: if settings differ; the message states each of them.
     """
     if different := differing_settings(found, expected):
-        listed = "; ".join(f"{name}: it has {a!r:.80}, expected {b!r:.80}" for name, (a, b) in different.items())
-        raise OptionError(f"{what} of other settings ({listed}); give another --out, or remove it")
+        listed = "; ".join(f"{name}: found {a!r:.80}, expected {b!r:.80}" for name, (a, b) in different.items())
+        raise OptionError(f"{what} with other settings ({listed}); give another --out, or remove the old files")
 
 
 def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:

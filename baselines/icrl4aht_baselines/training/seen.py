@@ -69,7 +69,7 @@ def read_trained_on(entries: Any, where: str) -> SeenInTraining:
         kinds = kinds or [name for name in TEAMMATE_PLUGINS.names if name == entry.family]
         if not kinds or entry.algorithm not in (None, *kinds):
             raise OptionError(f"{expected}; found {entry}")
-        try:  # a generated layout may be one that this process does not know, and that no test task has
+        try:  # generated layouts may be unknown in this process, and the layout track does not test on them
             layouts.append(entry.layout if is_generated(entry.layout) else get_layout(entry.layout).name)
         except UnknownNameError as error:
             raise OptionError(f"{where}: {TRAINED_ON}: {error}") from error
@@ -119,13 +119,13 @@ def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[s
 
 
 def overlap_marks(overlaps: Iterable[str]) -> str:
-    """Return the marks of kinds of overlap as text, such as " †§"; an empty string without overlap."""
+    """Return the symbols for kinds of overlap as text, such as " †§"; an empty string without overlap."""
     marks = "".join(OVERLAPS[name][0] for name in sorted_overlaps(overlaps))
     return f" {marks}" if marks else ""
 
 
 def overlap_legend(overlaps: Iterable[str]) -> list[str]:
-    """Return the meaning of each mark, such as "† ...", in the order of `OVERLAPS`."""
+    """Return a line for each kind of overlap, with its symbol and meaning, in the order of `OVERLAPS`."""
     return [" ".join(OVERLAPS[name]) for name in sorted_overlaps(overlaps)]
 
 

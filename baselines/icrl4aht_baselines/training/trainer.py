@@ -99,7 +99,7 @@ class Trainer:
         options: settings of the training.
 
     Raises:
-        OptionError: if a batch cannot be divided among devices and parts.
+        OptionError: if `batch_size` is not a multiple of the number of devices times `accumulate`.
     """
 
     def __init__(self, method: Method, options: TrainOptions) -> None:
@@ -132,7 +132,7 @@ class Trainer:
         return jax.jit(self._initial_state, out_shardings=self.everywhere)()
 
     def state_like(self) -> Any:
-        """Return the shapes, dtypes and shardings of the state, which restoring a checkpoint needs."""
+        """Return the shapes, dtypes and shardings of the state, for restoring a checkpoint."""
         shapes = jax.eval_shape(self._initial_state)
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=self.everywhere), shapes)
 
@@ -209,7 +209,7 @@ class TrainingTask(NamedTuple):
         data: samplers of the batches to train on and to validate with; unused by methods that play.
         options: settings of the training.
         about: settings of model and data for config.json.
-        trainer: object with the interface of `Trainer` that computes the steps; None for a `Trainer`.
+        trainer: object that computes the steps, with the interface of `Trainer`; None to make a `Trainer`.
     """
 
     method: Method

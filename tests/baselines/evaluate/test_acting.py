@@ -58,7 +58,7 @@ def test_evaluation_of_a_trained_model_stores_settings_of_its_run(runs, tmp_path
     settings = {"run": run.hash, "step": 2, "context": 30, "encoder": "paper", "acting": "cached"}
     settings["trained_on"] = run.trained_on
     assert result.settings["details"] == settings
-    with pytest.raises(OptionError, match=r"of other settings \(details.acting: it has .*; details.step: it has 2"):
+    with pytest.raises(OptionError, match=r"with other settings \(details.acting: found .*; details.step: found 2"):
         evaluate(agent.name, agent.make, WIDE[:1], SHORT, details={"step": 3}, out=tmp_path)
 
 

@@ -72,7 +72,7 @@ def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_retu
     path = tmp_path / "tasks" / f"{SIMPLE[0].task_id}.json"
     assert read_result(path) == first[0]
     for agent, seeds in (("random", [1]), ("stay", [0])):
-        with pytest.raises(OptionError, match="holds a result of other settings"):
+        with pytest.raises(OptionError, match="holds a result with other settings"):
             evaluate(agent, random, SIMPLE, PUBLISHED, seeds=seeds, out=tmp_path)
     content = json.loads(path.read_text())
     content["settings"]["seeds"] = [5]

@@ -52,7 +52,7 @@ def test_model_is_trained_evaluated_and_reported_with_held_out_teammates(suite, 
         small = "--steps 1 --context 8 --batch-size 2 --validation-batches 1 --next-obs"
         train = f"train dpt --root {server.url} --layout cramped_up {small} --out {trained}"
         printed = run_cli(f"{train} --ta")
-        with pytest.raises(OptionError, match=r"model\.teammate_actions: it has True, expected False"):
+        with pytest.raises(OptionError, match=r"model\.teammate_actions: found True, expected False"):
             run_cli(train)
     assert "size tiny, the default on a CPU: layers 1, width 8, encoder mlp" in printed
     assert "K = 8, steps 1, batch size 2" in printed and "1 step in" in printed

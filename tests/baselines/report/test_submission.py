@@ -72,8 +72,8 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: one["returns"][task].pop(), r"has 2 lists of \[100\] returns, expected 3 of 100"),
         (lambda c, one, task: one["settings"]["protocol"].update(name="published"), "protocol {'name': 'published'"),
         (lambda c, one, task: c.update(evaluations=c["evaluations"][2:]), "found only controls"),
-        (lambda c, one, task: one["settings"]["details"].update(forget=True), "of cleared, expected no control"),
-        (lambda c, one, task: c["evaluations"][2]["settings"]["details"].clear(), "of no control, expected cleared"),
+        (lambda c, one, task: one["settings"]["details"].update(forget=True), "found control cleared, expected none"),
+        (lambda c, one, task: c["evaluations"][2]["settings"]["details"].clear(), "control none, expected cleared"),
         (lambda c, one, task: c["facts"].update(data=""), "Expected `str` of length >= 1 - at `\\$.facts.data`"),
     ],
 )  # fmt: skip

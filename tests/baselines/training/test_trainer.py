@@ -126,7 +126,7 @@ class TestResume:
         assert not (tmp_path / "run").exists()
 
     def test_training_with_other_settings_than_the_run_raises_error(self, full_run):
-        with pytest.raises(OptionError, match=r"other settings \(train.seed: it has 0, expected 3\); give another"):
+        with pytest.raises(OptionError, match=r"other settings \(train.seed: found 0, expected 3\); give another"):
             train_tiny(full_run[0], changes={"seed": 3})
 
 
@@ -195,7 +195,7 @@ class TestFolder:
         open_run(tmp_path / "run", first)
         assert open_run(tmp_path / "run", corrected) == corrected == read_config(tmp_path / "run")
         shutil.copytree(full_run[0] / CHECKPOINTS, tmp_path / "run" / CHECKPOINTS)
-        with pytest.raises(OptionError, match=r"train.batch_size: it has 4, expected 1000000000"):
+        with pytest.raises(OptionError, match=r"train.batch_size: found 4, expected 1000000000"):
             open_run(tmp_path / "run", first)
 
     def test_run_folder_with_other_files_raises_error(self, tmp_path):
