@@ -200,7 +200,7 @@ def render_observations(
     channels: Channels = "own",
     obs: Rendered = "float32",
 ) -> np.ndarray:
-    """Render the ego's observations from rows of the configuration `episodes`, or of `hf_episodes`.
+    """Render the ego's observations from rows of `hf_episodes`, or of a release's Parquet files of episodes.
 
     With `datasets`, render while reading: `rows.map(lambda batch: {"obs": render_observations(batch)}, batched=True)`.
 
@@ -257,13 +257,13 @@ def _read_column(rows: Mapping[str, Any] | Sequence[Mapping[str, Any]], name: st
         ) from error
     except KeyError as error:
         raise NotStoredError(
-            f"rows without a column {name!r}: expected rows of the configuration `episodes`, or of hf_episodes, of a "
-            f"full or lite release; for a release of observations, which has no state records, use hf_windows"
+            f"rows without a column {name!r}: expected rows of hf_episodes, or of the configuration `episodes` of a "
+            f"full or lite release; a release of observations has no state records: use hf_windows"
         ) from error
 
 
 def hf_windows(sampler: Sampler, start: int = 0, stop: int | None = None) -> datasets.IterableDataset:
-    """Return the rows of batches start..stop as a `datasets.IterableDataset`, with the columns of the batch.
+    """Return the rows of batches start..stop as a `datasets.IterableDataset`, with a column for each batch field.
 
     Integers are int64, and `target_actions` are -100 on padding, as in `torch_loader`. Rows hold NumPy arrays of the
     batch's dtypes. The result declares no `features`: with features, `datasets` would convert one-dimensional arrays to

@@ -95,9 +95,9 @@ def running_mean(values: np.ndarray, window: int) -> np.ndarray:
 
 
 def return_limits(values: Iterable[float]) -> tuple[float, float]:
-    """Return the limits of an axis of returns that includes 0, all values, and the reward of one delivery.
+    """Return the limits of a plot axis that shows 0 and all given returns, and spans at least one delivery's reward.
 
-    Small variations of a constant return are therefore not magnified.
+    Small variations of an almost constant return are therefore not magnified.
     """
     found = [0.0, *values]
     low, high = min(found), max(found)
@@ -295,7 +295,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def legend_below(figure: Figure) -> None:
-    """Add one legend for all axes below the figure, in as many columns as fit the figure's width."""
+    """Add one legend of all axes at the bottom of a figure, in as many columns as fit its width, at most 5."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     entries = {

@@ -150,7 +150,7 @@ MAX_STEPS = 2**40
 """Upper limit of the number of steps of a history, so that sums of steps fit into 64 bits."""
 
 _NAME_LENGTH = 512  # maximum number of characters
-_FINITE = 1e15  # upper limit of numbers, so that sums stay finite
+_FINITE = 1e15  # limit of absolute values, so that sums of values stay finite
 
 _Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 StoredCount = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -261,7 +261,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return -(-self.rows(field) // field.chunk)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the index line as a JSON object, where `label_view` or `teammate_of_episode` is left out if None."""
+        """Return this entry as a JSON object; `label_view` and `teammate_of_episode` are left out if they are None."""
         content = json.loads(msgspec.json.encode(self))
         return {name: value for name, value in content.items() if value is not None or name not in _LEFT_OUT}
 

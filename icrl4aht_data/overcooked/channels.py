@@ -1,4 +1,4 @@
-"""Names of observation channels, and the canonical channels, which observations of all layouts share.
+"""Names of observation channels, and the canonical channels, which are the same for all layouts.
 
 A layout's own channels depend on its number of ingredient types and on its delivery indicator, so observations of
 different layouts can differ in shape. The canonical channels are the union of all layouts' channels; channels that a
@@ -26,16 +26,16 @@ CANONICAL_CHANNELS: tuple[str, ...] = tuple(packed_channels(CANONICAL_TYPES, Tru
 
 
 def channel_names(layout: Layout) -> tuple[str, ...]:
-    """Return the names of a layout's C own channels, in order; the docstring of `observe` explains the channels."""
+    """Return the names of a layout's own C channels, in order; the module docstring of `observe` explains them."""
     return tuple(packed_channels(layout.ingredient_types, layout.indicates_delivery))
 
 
 @lru_cache(maxsize=64)
 def canonical_positions(layout: Layout) -> np.ndarray:
-    """Return the canonical position of each of a layout's own channels, int64 (C,), ascending.
+    """Return the position of each of a layout's own channels in `CANONICAL_CHANNELS`, int64 (C,), ascending.
 
     Raises:
-        OptionError: if an ingredient of the layout has no canonical channel, that is, if no published layout has it.
+        OptionError: if an ingredient of the layout has no canonical channel: no published layout has the ingredient.
     """
     names = channel_names(layout)
     missing = [name for name in names if name not in CANONICAL_CHANNELS]

@@ -78,7 +78,7 @@ class Canvas:
         self.shapes.append(("box", x, y, width, height, fill, radius))
 
     def disc(self, x: float, y: float, radius: float, fill: Colour, part: float = 1) -> None:
-        """Add a disc, or with `part` < 1 only this fraction of the disc, clockwise from the top."""
+        """Add a disc, or only the fraction `part` of the disc, clockwise from the top."""
         self.shapes.append(("disc", x, y, radius, fill, part))
 
     def line(self, points: Sequence[tuple[float, float]], thickness: float, fill: Colour) -> None:
@@ -140,7 +140,7 @@ VIEW = "view"
 
 @lru_cache(maxsize=32)
 def state_parts(layout: Layout) -> tuple[StatePart, ...]:
-    """Return all parts of a layout's states in drawing order."""
+    """Return the parts that make up the picture of any state of a layout, in drawing order."""
     at, number = columns(layout), np.arange(record_size(layout))
     ego = int(number[at.positions][EGO])
     parts = []

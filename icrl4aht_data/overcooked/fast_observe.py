@@ -22,7 +22,7 @@ from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.state import columns, possible_recipes, record_size
 from icrl4aht_data.utils.system import run_in_slices
 
-_SLAB = 8192  # steps rendered at a time: in smaller blocks, function calls cost more time than the cache saves
+_SLAB = 8192  # steps rendered at a time; in smaller blocks, function calls cost more time than the CPU cache saves
 _IMPOSSIBLE = -(2**40)  # table entry so low that its sum with any other entry is negative
 _TIMERS = 32  # number of values of a five-bit timer
 _ON_COUNTER, _ON_BUTTON, _IN_POT = 0, 256, 512
@@ -71,7 +71,7 @@ class _Renderer:
         self._shape = observation_shape(layout, canonical)
         self._columns = columns(layout)
         fixed = fixed_channels(layout, canonical)
-        self._agent: int = fixed.start // 2  # number A of one agent's channels; both agents come first
+        self._agent: int = fixed.start // 2  # number A of one agent's channels; the channels of both agents come first
         self._first: int = fixed.stop  # first channel of items, recipes and timers, which can change
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
         self._recipes = np.append(np.uint8(0), possible_recipes(layout))
@@ -90,7 +90,7 @@ class _Renderer:
         background = self._by_positions.take(positions)
         background += self._by_recipe.take(recipe)
         if background.min() < 0 or (facings & 0xFCFC).any() or (record[:, self._columns.pot_timers] >= _TIMERS).any():
-            # The tables have no entry for a record that the rules cannot produce: `observe` renders the whole block.
+            # The tables have no entries for records that the rules cannot produce; `observe` renders their blocks.
             out.reshape(len(out), *self._shape)[...] = self._observe(record)
             return
         # mode="clip" avoids the temporary copy of `out` that the default mode makes in case an index is out of range.
@@ -129,9 +129,10 @@ class _Renderer:
         _as_items(cells[:, self._first :])[row * VISIBLE + where] = self._patches.take(patch)
 
     def _make_pair_lookups(self) -> None:
-        """Make tables intp (2**16,), indexed by two bytes with the low byte first; entries of impossible pairs are < 0.
+        """Make lookup tables intp (2**16,), indexed by pairs of bytes as low + 256 * high.
 
-        The entries of `_by_positions` and `_by_recipe` add up to the row of the background.
+        Entries of `_by_positions` and `_by_recipe` are < 0 for pairs that the background does not cover; otherwise the
+        two entries add up to the row of the background.
         """
         low, high = np.arange(2**16) & 255, np.arange(2**16) >> 8
         cells = self._layout.cells
@@ -141,7 +142,7 @@ class _Renderer:
         self._teammate_in_window = np.where(on_map, self._in_window[low % cells, high % cells], NOWHERE)
 
     def _make_cell_lookups(self) -> None:
-        """Make lookup tables indexed by the number of a changing cell: first pots, then buttons, then counters."""
+        """Make lookup tables for cells whose content can change: first pots, then buttons, then counters."""
         layout, where = self._layout, self._columns
         pots, buttons, counters = map(len, (layout.pots, layout.buttons, layout.counters))
         self._pots = pots
@@ -171,7 +172,7 @@ class _Renderer:
         return obs[:, CENTRE, : self._agent].astype(self._dtype)
 
     def _make_patches(self) -> np.ndarray:
-        """Return the changing channels of a cell, (512 + 32 * 256, C - first), by content, see `_ON_COUNTER`."""
+        """Return a cell's channels that can change, (512 + 32 * 256, C - `_first`), by content, see `_ON_COUNTER`."""
         layout, where = self._layout, self._columns
         every_byte = np.arange(256, dtype=np.uint8)
         record = np.zeros((2 + _TIMERS, 256, record_size(layout)), np.uint8)
@@ -192,7 +193,7 @@ class _Renderer:
 
 
 def _as_items(rows: np.ndarray) -> np.ndarray:
-    """Return rows (n, k) as opaque items (n,), since NumPy copies an item in one operation."""
+    """View each row of an array (n, k) as a single item, (n,), since NumPy copies an item in one operation."""
     return rows.view(np.dtype((np.void, rows.shape[-1] * rows.itemsize)))[..., 0]
 
 
@@ -203,5 +204,5 @@ def _index_of(values: np.ndarray) -> np.ndarray:
     return lookup
 
 
-# A renderer takes up to 4 MB; a release can have hundreds of layouts.
+# The cache is limited, since a renderer takes up to 4 MB and a release can have hundreds of layouts.
 _renderer = lru_cache(maxsize=256)(_Renderer)

@@ -76,7 +76,7 @@ class Layout:
             raise OptionError(f"layout {self.name}: {fault}")
 
     def _faults(self) -> Iterator[str]:
-        """Yield what is wrong with the map and the recipes; each check needs the ones before it to succeed."""
+        """Yield what is wrong with the map and the recipes; each check assumes that earlier checks found nothing."""
         if len({len(row) for row in self.rows}) != 1:
             yield f"the rows have widths {[len(row) for row in self.rows]}, expected equal widths"
         wrong = {c for row in self.rows for c in row if c not in _LETTERS and c not in digits}
@@ -135,7 +135,7 @@ class Layout:
 
     @cached_property
     def ingredient_types(self) -> int:
-        """Number n of ingredient channels, the highest id of a piled ingredient + 1."""
+        """Number n of ingredient types in the channels: the highest id of an ingredient that has a pile, plus 1."""
         return max(self.ingredients) + 1
 
     @cached_property
@@ -146,7 +146,7 @@ class Layout:
 
     @cached_property
     def channels(self) -> int:
-        """Number C of observation channels: 25 + 5n, or 26 + 5n with the delivery indicator."""
+        """Number C of observation channels: 25 + 5 * `ingredient_types`, plus 1 with the delivery indicator."""
         return 25 + 5 * self.ingredient_types + int(self.indicates_delivery)
 
     @property
@@ -169,7 +169,7 @@ class Layout:
 
     @cached_property
     def rooms(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pair of uint8 arrays: floor cells that the ego can reach, and that the teammate can reach; ascending."""
+        """Pair of ascending uint8 arrays: floor cells that the ego can reach, and those that the teammate can reach."""
         first, second = (self._reachable(cell) for cell in self.agent_cells)
         return first, second
 
@@ -178,7 +178,7 @@ class Layout:
         room, edge = set(), {start}
         while edge:
             room |= edge
-            # A step beyond the map's edge would wrap to another row; maps with a reachable edge raise an error.
+            # A step beyond the map's edge would wrap to another row, but `_faults` rejects maps with a reachable edge.
             edge = {cell + dy * self.width + dx for cell in edge for dx, dy in STEP.values()} & floor - room
         return np.array(sorted(room), np.uint8)
 
@@ -195,13 +195,13 @@ class Layout:
 
     @cached_property
     def ahead(self) -> np.ndarray:
-        """uint8 (cells, 4): cell in front of an agent, by the agent's cell and facing; 0 for cells not walkable."""
+        """uint8 (cells, 4): cell in front of an agent, by cell and facing; 0 if the agent's cell is not walkable."""
         steps = [dy * self.width + dx for dx, dy in (STEP[name] for name in FACINGS)]
         return np.where(self.walkable[:, None], np.arange(self.cells)[:, None] + steps, 0).astype(np.uint8)
 
     @cached_property
     def moves(self) -> np.ndarray:
-        """uint8 (cells, 6): an agent's next cell by its cell and action, if the other agent does not block it."""
+        """uint8 (cells, 6): an agent's next cell by its cell and action, unless the other agent blocks the move."""
         here = np.arange(self.cells, dtype=np.uint8)[:, None]
         target = self.ahead[:, FACING_OF]
         moved = np.where(self.walkable[:, None] & self.walkable[target], target, here)
@@ -241,7 +241,7 @@ class Layout:
 
     @cached_property
     def tables(self) -> Tables:
-        """Lookup tables of this layout, an argument of the functions of rules, observations and scripted agents."""
+        """Lookup tables of this layout, which the functions for rules, observations and scripted agents read."""
         return make_tables(self)
 
     def __repr__(self) -> str:
@@ -319,7 +319,7 @@ _RELEASE_LAYOUTS: dict[str, Layout] = {}  # layouts from releases opened in this
 
 
 def get_layout(name: str) -> Layout:
-    """Return the layout with a short name (coord_simple) or environment name (grounded_coord_simple).
+    """Return the layout with the given short name (coord_simple) or environment name (grounded_coord_simple).
 
     A layout registered by another package has only one name, see docs/extending.md.
 
@@ -370,7 +370,7 @@ class LayoutLine(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 @cache
 def _manifest_layouts() -> dict[str, Layout]:
-    """Return the layouts of this package's tasks that the paper does not have, by name."""
+    """Return, by name, the layouts of this package's tasks beyond the ten layouts of the benchmark."""
     path = Path(__file__).parent.parent / "manifests" / "layouts.jsonl"
     lines = msgspec.json.Decoder(LayoutLine).decode_lines(path.read_bytes())
     return {line.name: line.layout() for line in lines}
@@ -387,7 +387,7 @@ def with_recipes(layout: Layout, recipes: tuple[tuple[int, int, int], ...]) -> L
 
 
 def add_layouts(layouts: Iterable[Layout]) -> list[Layout]:
-    """Make layouts available to `get_layout` in this process, such as those stored in an opened release.
+    """Make layouts, such as those stored in an opened release, available to `get_layout` in this process.
 
     Returns:
         The layouts; a layout that was already available is returned as the earlier object.

@@ -51,13 +51,13 @@ def observe(layout: Layout | Tables, record: Array, agent: int, canonical: bool 
         OptionError: if the layout has an ingredient that has no canonical channel.
     """
     tables = tables_of(layout)
-    return _expand(tables, *_words(tables, record, agent), canonical)
+    return _expand(tables, *_packed_words(tables, record, agent), canonical)
 
 
 def observe_both(layout: Layout | Tables, record: Array, canonical: bool = False) -> Array:
     """Return the observations of ego and teammate, uint8 (B, 2, 5, 5, C); see `observe`."""
     xp, tables = record.__array_namespace__(), tables_of(layout)
-    ego, teammate = (_words(tables, record, agent) for agent in (0, 1))
+    ego, teammate = (_packed_words(tables, record, agent) for agent in (0, 1))
     agents, cells = (xp.stack(pair, axis=-2) for pair in zip(ego, teammate, strict=True))
     return _expand(tables, agents, cells, canonical)
 
@@ -69,7 +69,7 @@ def fixed_channels(layout: Layout, canonical: bool = False) -> slice:
 
 
 def _expand(tables: Tables, agents: Array, cells: Array, canonical: bool) -> Array:
-    """Unpack packed words of agents and of cells, uint32 (B, 25), to observations uint8 (B, 5, 5, C)."""
+    """Unpack the packed words of agents and cells, uint32 (B, 25) each, to observations uint8 (B, 5, 5, C)."""
     xp = agents.__array_namespace__()
     shift, mask, of_agents = (xp.asarray(one) for one in (tables.canonical if canonical else tables.own))
     if not len(shift):
@@ -79,8 +79,8 @@ def _expand(tables: Tables, agents: Array, cells: Array, canonical: bool) -> Arr
     return xp.reshape(values, (*agents.shape[:-1], WINDOW, WINDOW, len(shift)))
 
 
-def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
-    """Return two packed words uint32 (B, 25) per visible cell: one for the agents on it, one for the cell itself."""
+def _packed_words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
+    """Return two packed words per visible cell, uint32 (B, 25) each: for an agent on the cell, and for the cell."""
     xp = record.__array_namespace__()
     state = unpack(tables, record)
     me, other = state.positions[..., agent], state.positions[..., 1 - agent]
@@ -91,7 +91,7 @@ def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
 
     bodies = 1 | xp.astype(1 << (xp.astype(state.facings, xp.uint32) + 1), xp.uint32)
     bodies = bodies | xp.astype(state.hands, xp.uint32) << 5
-    # At most one agent is on a cell, and no agent is on NOWHERE, the number of all cells outside the map.
+    # At most one agent is on a cell, and no agent is on NOWHERE, which stands for any cell outside the map.
     cell, none = view >> CELL_BIT, xp.zeros_like(cells)
     agents = xp.where(cell == me[..., None], bodies[..., agent, None], none) | xp.where(
         cell == other[..., None], bodies[..., 1 - agent, None] << AGENT_BITS, none
@@ -100,7 +100,7 @@ def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
 
 
 def _packed_changing_cells(xp, state: State) -> Array:
-    """Return packed words uint32 (B, 3 + P + L + K) of a fixed cell (0), indicator, goal, pots, buttons, counters."""
+    """Return packed words uint32 (B, 3 + P + L + K): zero for fixed cells; indicator, goal, pots, buttons, counters."""
     # The shift by 2 removes the plate and cooked flags, which a recipe never has.
     recipe = xp.astype(state.recipe >> 2, xp.uint32)[..., None] << RECIPE_BIT
     delivered = xp.astype(state.delivered, xp.uint32)[..., None] << DELIVERY_BIT

@@ -73,7 +73,7 @@ def save_episode(
 def encode_episode(
     layout: Layout, records: np.ndarray, rewards: np.ndarray | None = None, *, cell: int = 32, fps: int = 8
 ) -> bytes:
-    """Return an episode as the content of a GIF file of T frames that loops endlessly.
+    """Return the content of a GIF file that shows an episode in T frames and loops endlessly.
 
     Args:
         layout: the layout.
@@ -119,13 +119,13 @@ def _check_records(layout: Layout, records: np.ndarray, dimensions: int, cell: i
     _require(fits, f"{expected} for layout {layout.name}", f"{records.dtype} {records.shape}")
     wrong = faults(layout, records)
     _require(not wrong, f"possible states of layout {layout.name}", "; ".join(wrong))
-    # Smaller cells lose details, and with larger ones an episode takes more than 400 MB.
+    # Smaller cells lose details, and with larger cells an episode takes more than 400 MB of memory.
     _require(16 <= check_int("cell", cell, 0) <= 128, "cell from 16 to 128 pixels", cell)
     return records
 
 
 def _shared_palette(frames: list[Image.Image]) -> Image.Image:
-    """Return a palette for all frames; colours are ranked by their largest pixel count in a frame."""
+    """Return a palette for all frames, with the colours that cover the most pixels in any one frame."""
     most = Counter()
     for frame in frames:
         most |= Counter({colour: count for count, colour in frame.getcolors(frame.width * frame.height) or []})
@@ -153,7 +153,7 @@ class _Picture:
         self.pen.rounded_rectangle((left, top, left + wide - 1, top + high - 1), self.unit * radius, fill)
 
     def disc(self, x: float, y: float, radius: float, fill: tuple, part: float = 1) -> None:
-        """Draw a disc, or with `part` < 1 only this fraction of the disc, clockwise from the top."""
+        """Draw a disc, or only the fraction `part` of the disc, clockwise from the top."""
         bounds = [self.unit * v for v in (x - radius, y - radius, x + radius, y + radius)]
         self.pen.pieslice(bounds, -90, 360 * part - 90, fill)
 

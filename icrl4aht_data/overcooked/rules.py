@@ -1,8 +1,8 @@
 """The rules: one step of the game as a pure function, for NumPy and JAX arrays, batch axes first.
 
-Order of a step (paper, App. A.1; constants checked against OvercookedV2): 1. Agents turn and move. 2. Moves onto one
-cell are undone. 3. Moves that swap the agents' cells are undone. 4. Agent 0 interacts, then agent 1 in the resulting
-state. 5. Timers count down. 6. A correct delivery changes the recipe.
+Order of a step (paper, App. A.1; constants checked against OvercookedV2): 1. Agents turn and move. 2. Moves that
+put both agents on one cell are undone. 3. Moves that swap the agents' cells are undone. 4. Agent 0 interacts, then
+agent 1 in the resulting state. 5. Timers count down. 6. A correct delivery changes the recipe.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def look_up(table: Array, index: Array) -> Array:
 
 
 def _move(tables: Tables, xp, state: State, actions: Array) -> State:
-    """Turn and move both agents; undo moves of both agents into one cell, and exchanges of cells."""
+    """Turn and move both agents; undo moves that put both agents on one cell or swap the agents' cells."""
     moved = look_up(tables.moves.reshape(-1), xp.astype(state.positions, xp.int32) * 6 + actions)
     old0, old1 = state.positions[..., 0], state.positions[..., 1]
     new0, new1 = moved[..., 0], moved[..., 1]

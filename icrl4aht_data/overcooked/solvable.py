@@ -34,25 +34,25 @@ def _delivery_fault(layout: Layout) -> str | None:
         faced[layout.ahead[room]] = True
     counters = bool((reach.all(axis=0) & (layout.kinds == WALL)).any())
 
-    def agents_at(fixtures: np.ndarray) -> np.ndarray:
-        """Return which agents, bool (2,), can face at least one of the cells `fixtures`, bool (N,)."""
+    def agents_facing(fixtures: np.ndarray) -> np.ndarray:
+        """Return bool (2,), True for agents that can face a cell of the mask `fixtures`, bool (N,)."""
         return np.any(reach & fixtures, axis=1)
 
     def after_handover(agents: np.ndarray) -> np.ndarray:
-        """Return which agents, bool (2,), can hold an item that the given agents, bool (2,), can take or hand over."""
+        """Return bool (2,), True for agents that can get an item that the agents of a mask, bool (2,), can take."""
         return agents | (counters and agents.any())
 
     for kind, what in _NEEDED.items():
-        if not agents_at(layout.kinds == kind).any():
+        if not agents_facing(layout.kinds == kind).any():
             return f"no agent can face {what}"
     pots = reach[:, layout.kinds == POT]  # (2, P), True for pots that each agent can face
-    plates, goals = after_handover(agents_at(layout.kinds == PLATES)), agents_at(layout.kinds == GOAL)
+    plates, goals = after_handover(agents_facing(layout.kinds == PLATES)), agents_facing(layout.kinds == GOAL)
     served = [pot for pot in pots.T if (after_handover(pot & plates) & goals).any()]
     if not served:
         return "no soup can reach a goal on a plate"
     for recipe in layout.recipes:
         piles = {one: (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(one)) for one in recipe}
-        available = {ingredient: after_handover(agents_at(piles[ingredient])) for ingredient in sorted(piles)}
+        available = {ingredient: after_handover(agents_facing(piles[ingredient])) for ingredient in sorted(piles)}
         for ingredient, agents in available.items():
             if not any((pot & agents).any() for pot in served):
                 return f"ingredient {ingredient} cannot reach a pot whose soup can be delivered"

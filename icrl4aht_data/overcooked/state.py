@@ -1,4 +1,4 @@
-"""State records: all inputs of the rules and the observations in S bytes (uint8); S depends on the layout, 14 to 36.
+"""State records: the game's state as S bytes (uint8), an input of rules and observations; 14 to 36 bytes by layout.
 
 Columns of a record, in order (columns of the agents: first the ego, then the teammate):
 
@@ -81,14 +81,14 @@ def _count_changing_cells(layout: Layout | Tables) -> tuple[int, int, int]:
 
 
 def padded_positions(layout: Layout, tables: Tables) -> np.ndarray:
-    """Return the positions of the bytes of a layout's state records in the padded records of a group of layouts.
+    """Return the columns of padded state records that hold the bytes of one layout's state records.
 
     Args:
-        layout: one layout of the group; its records have S bytes.
-        tables: lookup tables of the group, see `stack_tables`.
+        layout: one of the layouts that the records are padded for; its own records have S bytes.
+        tables: lookup tables of all these layouts, see `stack_tables`.
 
     Returns:
-        Positions, int (S,); `padded[..., positions]` are the layout's records without padding.
+        Columns, int (S,); `padded[..., columns]` are the layout's records without padding.
     """
     own, padded = columns(layout), columns(tables)
     lengths = [one.stop - one.start for one in own[5:]]
@@ -109,7 +109,7 @@ def pack(state: State) -> Array:
 
 
 def swap_agents(record: Array) -> Array:
-    """Exchange ego and teammate in state records uint8 (B, S), so that the ego gets the teammate's observation."""
+    """Exchange ego and teammate in state records uint8 (B, S); the ego then observes what the teammate observed."""
     order = np.arange(record.shape[-1])
     order[:6] = 1, 0, 3, 2, 5, 4  # the columns of positions, facings and hands
     return record[..., order]
@@ -134,7 +134,7 @@ def start_record(layout: Layout | Tables, positions: Array, facings: Array, reci
 
 
 def possible_recipes(layout: Layout) -> np.ndarray:
-    """Return the item bytes, uint8, ascending, of all recipes that the layout's piles allow; tasks use some of them."""
+    """Return the item bytes of all recipes that the layout's piles allow, uint8, ascending; tasks use some of these."""
     items = np.arange(256)
     plain = (items & (PLATE | COOKED) == 0) & (ingredient_count(items) == 3)
     return np.flatnonzero(possible_items(layout) & plain).astype(np.uint8)

@@ -72,10 +72,10 @@ class Tables(NamedTuple):
         column: int32 (cells,), x of each cell.
         row: int32 (cells,), y of each cell.
         walkable: bool (cells,), floor cells that at least one agent can reach.
-        ahead: uint8 (cells, 4), cell in front of an agent, by its cell and facing; 0 for cells not walkable.
+        ahead: uint8 (cells, 4), cell in front of an agent, by cell and facing; 0 if the agent's cell is not walkable.
         faced: int32 (cells, 4), properties of the cell in front of an agent: kind | pile << 8 | number << 16, where
             the number is the cell's position in `pots`, `counters` or `buttons`.
-        moves: uint8 (cells, 6), an agent's next cell by its cell and action, if the other agent does not block it.
+        moves: uint8 (cells, 6), an agent's next cell by its cell and action, unless the other agent blocks the move.
         view: int32 (cells, 25), for each agent position and window cell: number of the cell's changing word; from bit 8
             on, the fixed bits of its word, shifted down by FIXED_BIT; from CELL_BIT on, the cell's number, or NOWHERE
             outside the map.
@@ -262,7 +262,7 @@ def _shortest_paths(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         if np.array_equal(shorter, distance):
             break
         distance = shorter
-    # If several moves shorten the path, the first is taken, as a breadth-first search would do.
+    # If several moves shorten the path, the first in `SEARCH_ORDER` is taken, as in a breadth-first search.
     step = np.array(SEARCH_ORDER)[(after == distance[:, None]).argmax(axis=1)]
     return distance.astype(np.uint8), np.where((distance > 0) & (distance < far), step, STAY).astype(np.uint8)
 
@@ -278,13 +278,13 @@ def _make_view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> n
     for bit, ingredient in enumerate(layout.ingredients):
         pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
         fixed |= pile.astype(np.int32) << (_PILES - FIXED_BIT + bit)
-    # Cells outside the map have no fixed bits, word 0 of the changing words, which is always zero, and number NOWHERE.
+    # A cell outside the map has the number NOWHERE, no fixed bits, and changing word 0, which is always zero.
     packed = changing | fixed << 8 | np.arange(layout.cells) << CELL_BIT
     return np.where(layout.window >= 0, packed[layout.window], NOWHERE << CELL_BIT).astype(np.int32)
 
 
 def packed_channels(types: int, delivery: bool, layout: Layout | None = None) -> dict[str, tuple[int, int]]:
-    """Return the lowest bit and the bits of each observation channel in a visible cell's two packed words.
+    """Return the lowest bit and the bit mask of each observation channel in the two packed words of a visible cell.
 
     Args:
         types: number of ingredient types.
@@ -292,7 +292,7 @@ def packed_channels(types: int, delivery: bool, layout: Layout | None = None) ->
         layout: the layout; None if only the names of the channels are needed.
 
     Returns:
-        (lowest bit, bits) by channel name, in the order of the channels; bits 0 for channels that are always 0.
+        (lowest bit, mask) by channel name, in the order of the channels; mask 0 for channels that are always 0.
     """
     order = {ingredient: number for number, ingredient in enumerate(layout.ingredients if layout else ())}
 
@@ -321,7 +321,7 @@ def packed_channels(types: int, delivery: bool, layout: Layout | None = None) ->
 
 
 def _channel_bits(layout: Layout, types: int, delivery: bool) -> ChannelBits:
-    """Return the bits of the channels for `types` ingredient types and `delivery`; empty arrays if `types` is 0."""
+    """Return the `ChannelBits` for `types` ingredient types, with or without delivery; empty if `types` is 0."""
     channels = packed_channels(types, delivery, layout) if types else {}
     shift, mask = np.array(list(channels.values()), np.uint32).reshape(-1, 2).T
     return ChannelBits(shift, mask, np.array([name.startswith(("self", "other")) for name in channels], bool))

@@ -1,4 +1,4 @@
-"""Words: ids of the contents of the 25 visible cells, computed from state records, for NumPy and JAX.
+"""Words: one id for the content of each visible cell, computed from state records, for NumPy and JAX.
 
 A *word* is the vector of observation channels of one visible cell. A layout has only a few hundred different words, so
 a network can compute its per-cell layers once per word and read the results from a table. Several layouts share the
@@ -53,7 +53,7 @@ class _Slot(NamedTuple):
 
 
 class CellWords:
-    """All contents that a visible cell can have on one or several layouts; `cell_words` creates and caches it.
+    """All contents that a visible cell can have on one or several layouts; `cell_words` returns a cached instance.
 
     Attributes:
         layouts: layouts whose observations have the same channels.
@@ -80,7 +80,7 @@ class CellWords:
                 self._words[number, kind, pairs] = next(parts)
 
     def _fill_views(self, fixed: list[np.ndarray]) -> None:
-        """Fill the lookup tables of observer cells and of slots, see `_Slot`; slot 0 stands for all fixed cells."""
+        """Fill the lookup tables by the observer's cell and by slot, see `_Slot`; slot 0 stands for fixed cells."""
         count, cells = len(self.layouts), max(layout.cells for layout in self.layouts)
         slots = [[_Slot(_FIXED, [], 0), *_slots(layout)] for layout in self.layouts]
         self._slot = np.zeros((count, cells, VISIBLE), np.uint8)
@@ -120,7 +120,7 @@ class CellWords:
             number = xp.reshape(layout_number, (*layout_number.shape, *[1] * (len(batch) - layout_number.ndim)))
             number = xp.astype(xp.broadcast_to(number, batch), xp.int32)
 
-        def of_layout(table: np.ndarray, *indices: Array) -> Array:
+        def layout_values(table: np.ndarray, *indices: Array) -> Array:
             """Return `table[number, *indices]`, where `number` is the number of each record's layout."""
             flat = number
             for index, size in zip(indices, table.shape[1:], strict=False):
@@ -134,25 +134,25 @@ class CellWords:
         zeros = xp.zeros((*batch, self._size + 1 - record.shape[-1]), dtype=xp.uint8)
         padded = xp.concat([record, zeros], axis=-1)
         if several:
-            byte, second = (xp.take_along_axis(padded, of_layout(c), axis=-1) for c in (self._byte, self._second))
+            byte, second = (xp.take_along_axis(padded, layout_values(c), axis=-1) for c in (self._byte, self._second))
         else:
             byte, second = padded[..., self._byte[0]], padded[..., self._second[0]]
-        first = (number[..., None] if several else 0) * self._words[0].size + of_layout(self._kind) * _PAIRS
+        first = (number[..., None] if several else 0) * self._words[0].size + layout_values(self._kind) * _PAIRS
         by_slot = look_up(self._words.reshape(-1), first + pair_number(byte, second))
 
         me, other = record[..., agent], record[..., 1 - agent]
-        slots = xp.astype(of_layout(self._slot, me), xp.int32)
-        words = xp.take_along_axis(by_slot, slots, axis=-1) + of_layout(self._fixed, me)
+        slots = xp.astype(layout_values(self._slot, me), xp.int32)
+        words = xp.take_along_axis(by_slot, slots, axis=-1) + layout_values(self._fixed, me)
         facings, hands = record[..., 2:4], record[..., 4:6]
-        own = of_layout(self._words[:, _SELF], pair_number(hands[..., agent], facings[..., agent]))
-        others = of_layout(self._words[:, _OTHER], pair_number(hands[..., 1 - agent], facings[..., 1 - agent]))
-        position, relative = xp.arange(VISIBLE, dtype=xp.uint8), of_layout(self._window_position, me, other)
+        own = layout_values(self._words[:, _SELF], pair_number(hands[..., agent], facings[..., agent]))
+        others = layout_values(self._words[:, _OTHER], pair_number(hands[..., 1 - agent], facings[..., 1 - agent]))
+        position, relative = xp.arange(VISIBLE, dtype=xp.uint8), layout_values(self._window_position, me, other)
         words = xp.where(position == relative[..., None], others[..., None], words)
         return xp.astype(xp.where(position == CENTRE, own[..., None], words), xp.int32)
 
     @lru_cache  # noqa: B019 - instances live as long as the process, see `cell_words`
     def entries(self, agents: tuple[int, ...] = (0,)) -> np.ndarray:
-        """Return the entries of a flattened observation that can differ from 0 on these layouts.
+        """Return the entries of a flattened observation that can differ from 0 on at least one of `layouts`.
 
         Args:
             agents: the observing agents: 0 (ego), 1 (teammate). Agents can have different reachable cells, so two
@@ -177,7 +177,7 @@ class CellWords:
 
 @lru_cache(maxsize=16)
 def cell_words(layouts: tuple[Layout, ...], canonical: bool = False) -> CellWords:
-    """Return the cached vocabulary of the visible cells on the given layouts.
+    """Return the cached `CellWords` of the given layouts.
 
     Args:
         layouts: one layout or several layouts; without `canonical`, all must have the same number of channels.
@@ -208,7 +208,10 @@ def _fixed_cells(layout: Layout, canonical: bool) -> np.ndarray:
 
 
 def _contents(layout: Layout, canonical: bool) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Return by kind of content: the possible pairs as one number each, int (n,), and their channels, uint8 (n, C)."""
+    """Return, for each kind such as `_POT`, the possible contents, int (n,), and each content's channels, uint8 (n, C).
+
+    A content is one number for the two columns that a `_Slot` names: byte + 256 * second.
+    """
     item = np.arange(256)
     possible, count = possible_items(layout), ingredient_count(item)
     carried = np.flatnonzero(possible & ((item & PLATE > 0) | (count <= 1)))

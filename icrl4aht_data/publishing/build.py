@@ -105,7 +105,7 @@ def first_problems(problems: Sequence[str]) -> str:
 
 
 def _is_written_by_build(name: str) -> bool:
-    """Return whether the build writes this file itself, instead of copying it from the source."""
+    """Return whether `build_release` writes a file itself, instead of copying the file from the source."""
     folders = ("figures/", f"{PARQUET_INDEX}/", f"{PARQUET_EPISODES}/")
     is_card = name == RELEASE_CARD or name.endswith(f"/{RELEASE_CARD}")
     return is_card or name in (CARD_TABLES, CROISSANT, *_COPIED_TEXTS) or name.startswith(folders)

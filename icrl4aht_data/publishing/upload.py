@@ -118,8 +118,8 @@ def _complete_plan(api: HfApi, plan: Upload, folder: Path, private: bool) -> Upl
     if commit is not None:
         if differences := _differences(api, plan, commit, folder):
             raise UploadError(
-                f"{plan.repo}: tag {plan.tag} exists with other content: {first_problems(differences)}; tags do not "
-                "move: give the release another data version"
+                f"{plan.repo}: tag {plan.tag} exists with other content: {first_problems(differences)}; an existing "
+                "tag is never moved: give the release another data version"
             )
         return replace(plan, done="already there", commit=commit)
     if private and not api.repo_info(plan.repo, repo_type="dataset").private:

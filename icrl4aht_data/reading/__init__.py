@@ -1,1 +1,1 @@
-"""Reading histories: selections, shards, chunk cache, and sources in memory, memory-mapped or streamed."""
+"""Reading of histories: selections, shards, a cache of chunks, and arrays in memory, memory-mapped or streamed."""

@@ -111,7 +111,7 @@ class History(FieldArrays):
         return self._shard.read(self.entry.history_id, field, start, stop)
 
     def rows(self, name: str, start: int, stop: int) -> np.ndarray:
-        """Return the same rows as `read`, but "obs" in the form that the options `obs` and `channels` choose."""
+        """Return rows start..stop of a field; "obs" has the form given by the options `obs` and `channels`."""
         if name in self._arrays:
             return self._arrays[name][start:stop]
         if name != "obs":

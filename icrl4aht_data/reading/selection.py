@@ -96,7 +96,7 @@ class Selection:
                 f'obs = "state": {self.origin} has observations only, no state records; use float32 or uint8'
             )
 
-    # The pickle for workers of a data loader omits decoded arrays: each worker opens a new source.
+    # Pickles, which data loaders send to their workers, omit decoded arrays; each worker opens its own.
     def __getstate__(self) -> tuple:
         return self._shards, self.options, self.ids
 
@@ -110,7 +110,7 @@ class Selection:
         Raises:
             OptionError: if the selection's layouts have different numbers of channels, unless channels are canonical.
         """
-        # Layouts may share a shape, so the first layout of each shape is enough for the message.
+        # Several layouts may have the same shape; the message lists each shape once.
         shapes = {observation_shape(layout, self.channels == "canonical"): layout for layout in self.layouts}
         if len(shapes) > 1:
             raise OptionError(
@@ -159,7 +159,7 @@ class Selection:
         )
 
     def named_counts(self, name: str) -> str:
-        """Return the values of an index field as text, such as "source ppo" or "sources ppo (120), noise (64)"."""
+        """Return an index field's name and values, such as "source ppo" or "sources ppo (120), noise (64)"."""
         counts = self.counts(name)
         return f"{name} {next(iter(counts))}" if len(counts) == 1 else f"{name}s {self.counts_text(name)}"
 
@@ -191,12 +191,12 @@ class Selection:
         return {value: number for value, number in found if value and number}
 
     def has_labels(self, labels: Labels) -> np.ndarray:
-        """Return bool (H,), True for histories with labels of a kind; see `history.LABELS`.
+        """Return bool (H,), True for histories that have labels of the given kind; see `history.LABELS`.
 
         In noise histories, oracle labels are equal to expert actions, and exist even if `has_oracle_actions` is False,
         since equal actions need not be stored twice; see `Entry.stored_field`.
         """
-        # In noise histories oracle and expert labels are equal, and stored once, as expert labels.
+        # In noise histories oracle and expert labels are equal, so a release may store only the expert labels.
         has = self.column(f"has_{labels}_actions")
         return has if labels == "expert" else has | ((self.column("source") == "noise") & self.has_labels("expert"))
 
@@ -294,7 +294,7 @@ class Selection:
 
     @property
     def storage(self) -> HistorySource:
-        """Source of the selection's rows in cache mode `cache`; `ram` and `mmap` decode all rows on first access."""
+        """Reader of the selection's rows in cache mode `cache`; `ram` and `mmap` decode all rows on first access."""
         if self._source is None:  # no lock, which a fork could leave locked; parallel accesses may decode twice
             self._source = open_source(self.cache.cache, self.entries, self._shards, self.threads)
         return self._source

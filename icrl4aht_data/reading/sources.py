@@ -1,6 +1,6 @@
 """Cache modes for the histories of a selection: `ram`, `mmap` and `stream`, which return the same rows.
 
-ram      records and scalars decoded once into flat arrays in memory; reading a window is one copy
+ram      records and scalars decoded once into concatenated arrays in memory; reading a window is one copy
 mmap     the arrays of `ram`, decoded once into the cache folder and memory-mapped, shared by processes
 stream   chunks read, checked and inflated on threads when a window needs them
 
@@ -29,7 +29,7 @@ CacheMode = Literal["auto", "ram", "mmap", "stream"]
 
 _VERSION = 2  # version of the memory-mapped arrays' format
 _COPIED = 2**20  # bytes copied at a time, so that NumPy's intermediate copy fits into the processor's cache
-_STEPS = 8192  # fewest steps for which another thread saves time
+_STEPS = 8192  # minimum number of steps for which another thread saves time
 
 
 class CacheChoice(NamedTuple):
@@ -76,7 +76,7 @@ def choose_cache(cache: CacheMode, size: int) -> CacheChoice:
 
 
 def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episodes: int) -> int:
-    """Return the size in bytes of one layout's decoded histories, from their total numbers of steps and episodes."""
+    """Return the size in bytes of decoded histories of one layout, given their number, steps and episodes."""
     rows = {"T": steps + histories + 1, "E": episodes}
     return sum(rows[field.axis] * field.memory_dtype(layout).itemsize for field in memory_fields(kind))
 
@@ -145,17 +145,17 @@ def _decode(
 
 
 def _first_rows(entries: Sequence[Entry], axis: str) -> np.ndarray:
-    """Return int (H,): the row of each history's first step or episode in flat arrays.
+    """Return int (H,): the row of each history's first step or episode in arrays of concatenated histories.
 
-    A row of zeros precedes the steps of each history, in place of a previous step, and another one follows the last
-    history.
+    A row of zeros precedes the steps of each history, in place of a previous step, and a further row of zeros follows
+    the last history.
     """
     lengths = np.array([entry.T + 1 if axis == "T" else entry.episodes for entry in entries])
     return np.cumsum(lengths) - lengths + (1 if axis == "T" else 0)
 
 
 class FlatSource:
-    """Source that reads flat arrays of concatenated histories, in memory or memory-mapped, one set per layout."""
+    """Source that reads concatenated histories from arrays in memory or memory-mapped arrays, one set per layout."""
 
     def __init__(self, entries: Sequence[Entry], threads: int) -> None:
         self._ids, self._threads = np.array([entry.history_id for entry in entries]), threads
@@ -201,7 +201,7 @@ class FlatSource:
         if rows.ndim == 2:
             gather_rows(array, first[:, None] + rows, out)
             return
-        # A row of zeros follows each history, so a window that ends at most one step after it is one block.
+        # A row of zeros follows each history, so a window that ends at most one step after the history is one block.
         # Copying 64 windows of 500 state records takes 60 microseconds as blocks, 120 row by row.
         if length <= len(array) and (rows + length - count[histories] <= 1).all():
             _copy_windows(array, first + rows, out)
@@ -280,7 +280,8 @@ HistorySource = FlatSource | StreamedSource
 def _read_in_threads(read: Callable[[ReadRequest], None], requests: Sequence[ReadRequest], threads: int) -> None:
     """Call `read` with parts of the requests, in several threads if there are enough steps.
 
-    All requests are divided at the same shares of their rows, so one thread usually reads windows that share chunks.
+    All requests are split at the same fractions of their rows, so windows that share chunks are usually read by one
+    thread.
     """
     rows, steps = max((request.out.shape[:2] for request in requests), key=lambda shape: shape[1])
 

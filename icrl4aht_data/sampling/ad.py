@@ -62,7 +62,7 @@ class ADBatch(NamedTuple, Generic[A]):
 
 
 class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torch.Tensor]"]):
-    """A sequence of batches for Algorithm Distillation, each a pure function of (selection, options, seed, i).
+    """A sequence of batches for Algorithm Distillation; batch i is a pure function of (selection, options, seed, i).
 
     For each row, a history is drawn uniformly from the selection (or by `weights`), and the first step of a window
     uniformly from 0..T - L. Windows cross episode boundaries. Rows are padded with zeros at the end if the history, or
@@ -143,7 +143,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
 
     @cached_property
     def _family_numbers(self) -> np.ndarray:
-        """Index of the family of each history's teammate in `all_families()`, int32 (H,)."""
+        """Position of each history's teammate family in `all_families()`, int32 (H,)."""
         families = all_families()
         return np.array([families.index(str(name)) for name in self.dataset.column("teammate_family")], np.int32)
 
@@ -178,11 +178,11 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         if self.every == 1:
             # A window given by its first row is copied as a block, ten times faster than L single rows.
             return position, low + start, low + start, low + start - 1, valid
-        # Step t of a window is step t % steps of episode first + n * (t // steps) of the range. The row of step
-        # -1 comes first, for `prev_*`. Padding repeats the last step, since all rows must exist.
+        # `t` numbers the steps of every n-th episode: step t % steps of episode first + n * (t // steps) of the range.
+        # The step before the window comes first, for `prev_*`. Padding repeats the last step, since rows must exist.
         t = np.minimum(start[:, None] + np.arange(-1, self.length), total[:, None] - 1)
         rows = low[:, None] + (first[:, None] + self.every * (t // steps)) * steps + t % steps
-        # At a window's first step, `prev_*` come from the preceding step of the history, also across episodes.
+        # At the first step of episode `first`, `prev_*` come from the history's preceding episode, if there is one.
         rows[start == 0, 0] = (low + first * steps - 1)[start == 0]
         return position, rows[:, 1], rows[:, 1:], rows[:, :-1], valid
 

@@ -125,7 +125,7 @@ class Sampler(Generic[B, D, T]):
         return (self[i] for i in range(len(self)))
 
     def batch(self, i: int, out: B | None = None) -> B:
-        """Return batch number `i`; if `out`, a batch from `empty()`, is given, its arrays are filled and returned.
+        """Return batch number `i`; if a batch from `empty()` is given as `out`, fill and return this batch.
 
         Raises:
             OptionError: if `out` has another type, shape or dtype, or the batch is larger than the free memory.
@@ -160,7 +160,7 @@ class Sampler(Generic[B, D, T]):
         """Return the options that determine the batches, as JSON; `Batches` compares the options when it resumes."""
         return {
             "sampler": type(self).__name__,
-            # A hash is shorter: the ids of 82,000 histories would fill every checkpoint.
+            # The ids are hashed, since these options are stored in checkpoints and a selection can have 82,000 ids.
             "selection": hashlib.blake2b(self.dataset.ids.astype("<i8").tobytes(), digest_size=16).hexdigest(),
             "data_version": self.dataset.info.data_version,
             "obs": self.dataset.obs,
@@ -230,7 +230,7 @@ def check_labels(dataset: Selection, labels: Labels) -> None:
     counts = ", ".join(f"{int(has[name].sum())} have {name} actions" for name in LABELS)
     tasks = dataset.column("task_id")[missing]
     raise LabelsMissingError(
-        f"labels = {labels}: {len(missing)} of {len(dataset)} histories have no {labels} actions, those of "
+        f"labels = {labels}: {len(missing)} of {len(dataset)} histories have no {labels} actions, in "
         f"{counted_noun(len(np.unique(tasks)), 'task')} (first: history {dataset.ids[missing[0]]} of task {tasks[0]}); "
         f"{counts}: use labels that all histories have, or ds.select(ds.has_labels({labels!r}))"
     )

@@ -66,13 +66,13 @@ class Batches(Iterator[B], Generic[B]):
         self.next, self.served, self.waited = check_int("start", start, 0), 0, 0.0
         self._per_pass = 0 if self._stop is None else max(0, self._stop - self.next)
         self._closed, self._ended, self._process = False, False, os.getpid()
-        self._pool: ThreadPoolExecutor | None = None  # without it, batches can be pickled before the first one
+        self._pool: ThreadPoolExecutor | None = None  # set at the first batch; until then, the iterator can be pickled
         self._pending: deque[tuple[Future[B], B | None]] = deque()  # submitted batches with their buffers
         self._free: list[B] = []
         self._lent: B | None = None  # buffer of the batch in use by the consumer
 
     def __iter__(self) -> Batches[B]:
-        # A new pass starts only after iteration reached the end: a position loaded at the end is a finished run.
+        # A new pass starts only after a loop reached the end: if a position at the end is loaded, a loop is empty.
         if self._ended and self._stop is not None and self._per_pass:
             self._stop += (self.next - self._stop) // self._per_pass * self._per_pass + self._per_pass
             self._closed = self._ended = False
@@ -92,7 +92,7 @@ class Batches(Iterator[B], Generic[B]):
         if self._process != os.getpid():
             raise OptionError(
                 f"this iterator belongs to process {self._process}; its thread does not exist in this forked process: "
-                f"make a new one here with sampler.batches(start={self.next}), or take sampler[{self.next}]"
+                f"make a new iterator here with sampler.batches(start={self.next}), or take sampler[{self.next}]"
             )
         started = time.perf_counter()
         if self._lent is not None:
@@ -133,7 +133,7 @@ class Batches(Iterator[B], Generic[B]):
             self._pending.append((self._pool.submit(_make_batch, self._sampler, i, buffer, self._put), buffer))
 
     def _buffer(self) -> B | None:
-        """Return a free buffer, or None if a new batch allocates its memory."""
+        """Return a buffer for the next batch, or None if buffers are not reused."""
         if not self._reuse:
             return None
         buffer = self._free.pop() if self._free else self._sampler.empty()
@@ -180,7 +180,7 @@ class Batches(Iterator[B], Generic[B]):
         wrong = [name for name in expected.keys() | given.keys() if expected.get(name) != given.get(name)]
         if wrong or "next" not in state:
             found = ", ".join(f"{name} = {given.get(name)!r}, not {expected.get(name)!r}" for name in sorted(wrong))
-            raise OptionError(f"the state belongs to other batches: it has {found or 'no `next`'}")
+            raise OptionError(f"the state belongs to a different sampler: it has {found or 'no `next`'}")
         self._stop_thread()
         self._closed = self._ended = False
         self.next = check_int("next", state["next"], 0)

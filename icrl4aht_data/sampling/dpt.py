@@ -59,7 +59,7 @@ class DPTBatch(NamedTuple, Generic[A]):
 
 
 class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[torch.Tensor]"]):
-    """A sequence of batches of queries with contexts, each a pure function of (selection, options, seed, i).
+    """A sequence of batches of queries with contexts; batch i is a pure function of (selection, options, seed, i).
 
     For each row a task is drawn uniformly, then two histories of the task independently (uniformly or by `weights`):
     one for the query, whose step is drawn uniformly, and one for the context of K transitions. Transitions are
@@ -150,7 +150,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
             # Windows given by their first row are copied as blocks. The row after the end of a history has zeros.
             rows, next_rows = steps[:, 0], steps[:, 0] + 1
         else:
-            # Single rows after a history's end cannot be read: its last row is read instead, and replaced below.
+            # Single rows after a history's end cannot be read: the history's last row is read, and replaced below.
             rows, next_rows = steps, np.minimum(steps + 1, self._draws.lengths[context][:, None] - 1)
         # Requests need the axis Q, which arrays with one query do not have.
         queries, record = query_steps.shape, records.shape[2:]
@@ -192,7 +192,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         drawn = self.length if self.order == "random" else 1
         random = self._random(i, 3 + self.queries + drawn)
         for_task, for_query, for_context = random[:3]
-        # The first query is drawn before the context, so it does not depend on the number of queries.
+        # The random numbers of further queries come last, so context and first query do not depend on `queries`.
         for_query_steps = np.concatenate([random[3:4], random[4 + drawn :]]).T
         for_steps = random[4 : 4 + drawn].T
 
@@ -213,7 +213,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
 
     @cached_property
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions in the selection sorted by task, int64 (H,), and where each task starts and ends in this order."""
+        """Positions of histories sorted by task, int64 (H,), and the start and end of each task in this order."""
         _, first, task = np.unique(self.dataset.column_codes("task_id"), return_index=True, return_inverse=True)
         task = np.argsort(np.argsort(first))[task]  # tasks are renumbered in order of first appearance
         sizes = np.bincount(task)

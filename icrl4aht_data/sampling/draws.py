@@ -27,10 +27,10 @@ EpisodeRange = tuple[int | None, int | None]
 
 @dataclass(frozen=True)
 class Curriculum:
-    """The part of every history from which windows are drawn, which moves linearly with the batch number.
+    """The part of every history that windows are drawn from; this part moves linearly with the batch number.
 
-    Parts are fractions of a history's episodes, or of the range `episodes` of the sampler. The part
-    moves from `first` at batch 0 to `last` at batch `batches` and does not change afterwards.
+    A part is given as fractions of a history's episodes, or of the sampler's range `episodes`. The part moves from
+    `first` at batch 0 to `last` at batch `batches` and does not change afterwards.
 
     Args:
         batches: number of the first batch with the part `last`, at least 1.
@@ -62,7 +62,7 @@ class Curriculum:
 
 
 def random_uint32(seed: int, i: int, count: int, batch_size: int) -> np.ndarray:
-    """Return random integers below 2**32, uint64 (count, batch_size), a function of (seed, i) and the shape."""
+    """Return random integers below 2**32, uint64 (count, batch_size), that depend only on the arguments."""
     i = check_int("batch", i, 0)
     # The raw output of Philox is specified, so batches do not depend on the NumPy version.
     raw = Philox(key=np.array([seed, i], np.uint64)).random_raw(count * batch_size)
@@ -101,7 +101,7 @@ def weighted_choice(random: np.ndarray, weights: np.ndarray | None, first: Any, 
     """
     if weights is None:
         return first + scale_to_range(random, stop - first)
-    # side="right": a weight of 0 makes two equal edges, and its empty interval must be skipped.
+    # side="right" skips the empty interval between two equal edges, which a weight of 0 makes.
     edges = np.concatenate([[0.0], np.cumsum(weights, dtype=np.float64)])
     low, high = edges[first], edges[stop]
     position = np.searchsorted(edges, low + random.astype(np.float64) / 2**32 * (high - low), side="right") - 1
@@ -141,7 +141,7 @@ class HistoryDraws:
         if self.curriculum is not None:
             low, high = self.curriculum.part(i)
             count = stop - first
-            # The part has one or more complete episodes. Without 1e-9, rounding errors could turn 0.3 * 10 into 4.
+            # The part has one or more complete episodes. Without 1e-9, rounding could make ceil(0.3 * 10) equal to 4.
             low = np.minimum(np.floor(low * count + 1e-9).astype(np.int64), count - 1)
             high = np.maximum(np.ceil(high * count - 1e-9).astype(np.int64), low + 1)
             first, stop = first + low, first + high
@@ -149,7 +149,7 @@ class HistoryDraws:
         return first * self.kept_steps, np.where(stop == self._counts, self.lengths, stop * self.kept_steps)
 
     def history_weights(self, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
-        """Return the weights of histories with steps low..high to draw from, float64 (H,); None for equal weights."""
+        """Return the histories' weights for ranges of steps low..high, float64 (H,); None for equal weights."""
         if isinstance(self.weights, str):
             return None if self.weights == "uniform" else (high - low).astype(np.float64)
         # Sums of weights near 1e308 would be infinite. Scaling by a power of 2 is exact and changes no draw.

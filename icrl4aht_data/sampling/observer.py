@@ -29,7 +29,7 @@ class ArraySpec(NamedTuple):
 
 
 class Observer:
-    """Renderer of the records of a selection as observations.
+    """Renders the stored records of a selection as observations.
 
     A record is a state record, or in a release without states the stored observation. `R` denotes the shape of one
     record: (S,) with the longest state record of the selection, or (5, 5, C) with the most channels of its layouts.

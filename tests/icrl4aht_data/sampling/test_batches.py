@@ -128,7 +128,7 @@ def test_resumed_batches_continue_after_the_last_consumed_batch(sampler):
 
 SIZES: dict[str, Any] = {"batch_size": 3, "length": 9}
 OTHER_BATCHES = {
-    "belongs to other batches: it has seed = 0, not 4": lambda ds: ds.ad(seed=4, **SIZES),
+    "belongs to a different sampler: it has seed = 0, not 4": lambda ds: ds.ad(seed=4, **SIZES),
     "it has selection = ": lambda ds: ds[1:].ad(**SIZES),
     "it has every = None, not 2": lambda ds: ds.ad(every=2, **SIZES),
     "it has labels = None, not 'oracle'": lambda ds: ds.ad(labels="oracle", **SIZES),
