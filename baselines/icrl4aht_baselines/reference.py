@@ -1,11 +1,11 @@
 """Make the reference models, from a release of scripted histories to evaluated models and their cards.
 
     OUT/PROFILE/lite                    release that `icrl4aht-data generate --profile PROFILE` makes
-    OUT/agent-TRACK[-TEACHER]           histories of RL^2 with falling noise, source `agent`, see `RL2_HISTORIES`
+    OUT/agent-TRACK[-TEACHER]           histories of the teacher with falling noise, see `RL2_HISTORIES`
     OUT/NAME-TRACK-sSEED/run            run folder of the model NAME
     OUT/NAME-TRACK-sSEED/first          run folder of the first of two training runs of a model
-    OUT/NAME-TRACK-sSEED/own            histories that this first model plays, labelled by RL^2
-    OUT/NAME-TRACK-sSEED/mixed          the histories of the first training together with the model's histories
+    OUT/NAME-TRACK-sSEED/own            histories that the model of the first run plays, labelled by the teacher
+    OUT/NAME-TRACK-sSEED/mixed          these histories together with those that the first run learned from
     OUT/NAME-TRACK-sSEED/results/KIND   results on validation tasks and on test tasks
 
 Finished parts are reused, and stopped parts resume.
@@ -140,7 +140,7 @@ RECIPES = {
 
 
 def check_learns_from_teacher(name: str) -> None:
-    """Check that a reference model learns from histories of a teacher, as the choice of a teacher requires.
+    """Check that a reference model learns from histories of a teacher, so that a teacher can be chosen.
 
     Raises:
         OptionError: if the model learns by playing.
@@ -193,7 +193,7 @@ class ReferenceJob(TrainingJob):
 
     @property
     def updates(self) -> int:
-        """Number of training steps of all training runs."""
+        """Number of training steps, of both training runs if there are two."""
         return self.training.steps * (1 + self.recipe.own_round)
 
     @property
@@ -211,11 +211,11 @@ class ReferenceJob(TrainingJob):
         return to_builtins({"recipe": self.recipe, "views": views, "play": play, **data, **code})
 
     def runs(self) -> list[tuple[Path, int]]:
-        """Return the folders of the training runs, last one first, with the number of earlier training steps."""
+        """Return the folders of the training runs, last run first, with the number of earlier training steps."""
         return [(self.run_folder, self.updates - self.training.steps), (self.folder / "first", 0)]
 
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
-        """Train the model with everything that it needs. Return no values."""
+        """Make the training data and train the model. Return no measured values."""
         if self.recipe.plays:
             self.train_by_playing(on_update)
             return {}
@@ -262,7 +262,7 @@ class ReferenceJob(TrainingJob):
         job.train(self.run_folder, params=params, done=self.step_progress(on_update))
 
     def trained_teacher(self) -> str | Path:
-        """Return the teacher, which is trained first if it is not given."""
+        """Return the teacher; without a given teacher, train RL^2 first."""
         if self.teacher:
             return self.teacher
         job = ReferenceJob("rl2-reference", self.track, 0, self.out)
@@ -280,7 +280,7 @@ class ReferenceJob(TrainingJob):
         return folder
 
     def train(self, root: Path, folder: Path, on_update: OnUpdate, before: Path | None = None) -> None:
-        """Train a model on a release; with `before`, start from that run's parameters, at a lower learning rate."""
+        """Train a model on a release; with `before`, start from this run's parameters, at a lower learning rate."""
         options = self.training
         if before:
             options = replace(options, learning_rate=OWN_SHARE * options.learning_rate)
@@ -301,7 +301,7 @@ class ReferenceJob(TrainingJob):
         return mixed
 
     def evaluation_tasks(self, split: str) -> list[Task]:
-        """Return the tasks of a split on the track, or on all tracks; the split "diverse" has only published tracks."""
+        """Return the tasks of a split on the track, or on all tracks that have tasks of the split."""
         published = tuple(TRACKS) if split == "diverse" else ALL_TRACKS
         tracks = published if self.track == EVERY_TRACK else (self.track,)
         return [task for track in tracks for task in bundled_tasks(track, split)]

@@ -62,7 +62,7 @@ train rl2 --layout demo_wide --size tiny | --size: cannot be used with rl2, whic
 train rl2 --layout all --next-obs --context 5 | --context, --next-obs: cannot be used with rl2, which learns by playing
 train ad --layout demo_wide --epochs 2 | --epochs: cannot be used with ad, only with rl2, which learns by playing
 research reference --name rl2-reference --no-evaluate --bundle-as rl2-x | because the card states its results
-research reference --name rl2-reference --track preference | rl2-reference have no model of it; leave out --track
+research reference --name rl2-reference --track preference | rl2-reference have no model for it; leave out --track
 research reference --name rl2-reference --bundle-as Bad-Name | name = 'Bad-Name': expected lowercase words
 results | Missing option '--out'
 submit empty --out r.json --about a | Missing option '--data'

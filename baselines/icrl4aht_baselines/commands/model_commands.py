@@ -196,7 +196,7 @@ def reference_command(
         if of_track in (*track, EVERY_TRACK)
     ]
     if not jobs:
-        raise click.UsageError(f"--track {track[0]}: {' and '.join(names)} have no model of it; leave out --track")
+        raise click.UsageError(f"--track {track[0]}: {' and '.join(names)} have no model for it; leave out --track")
     taught = {job.track: None for job in jobs if not (job.recipe.plays or teacher)}
     teachers = [ReferenceJob("rl2-reference", of_track, 0, out) for of_track in taught]
     limit_xla_threads(1)  # equal to the workers' limit, so that workers can resume these jobs
@@ -304,9 +304,9 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
 def models_command() -> None:
     """List the bundled models.
 
-    The names of the models are accepted as agents by `evaluate`, `watch` and `collect`. The first line of a model
-    states its purpose, its score N on each track, its memory control M and its date. A line for each track states
-    method, parameters, context, training layouts and sources, and whether actions are sampled by default.
+    `evaluate`, `watch` and `collect` accept these names as agents. The first line of a model states its purpose, its
+    score N on each track, its memory control M and its date. A line for each track states method, parameters, context,
+    training layouts and sources, and whether actions are sampled by default.
     """
     from icrl4aht_baselines.agents.bundled import bundled_models, describe_model
     from icrl4aht_baselines.report.comparison import describe_scores, read_stored, results_file
