@@ -93,7 +93,7 @@ def shard_names(folder: Path) -> set[str]:
 # Tests of reading remote releases
 
 
-def test_remote_release_with_the_source_card_of_older_versions_can_be_opened(lite, tmp_path):
+def test_remote_release_of_an_older_version_with_a_source_card_file_can_be_opened(lite, tmp_path):
     shutil.copytree(lite[0], tmp_path / "served")
     (tmp_path / "served" / "meta" / "source_card.md").write_text("# card\n")
     write_manifest(tmp_path / "served")
@@ -332,7 +332,7 @@ def test_download_stops_at_the_first_failing_file(lite, tmp_path):
 
 
 @pytest.mark.parametrize("what", ["http", "hub", pytest.param("s3", marks=pytest.mark.slow), "refused", "hub refused"])
-def test_a_silent_server_times_out(what, tmp_path, monkeypatch):
+def test_silent_or_unreachable_server_raises_error_within_seconds(what, tmp_path, monkeypatch):
     """The server accepts connections and never answers, or nothing listens at the address."""
     monkeypatch.setattr(clients, "_TIMEOUT", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as server:

@@ -43,7 +43,7 @@ class TestLoaderPasses:
         np.testing.assert_array_equal(first[0].obs, sampler[n + 3].obs)
         np.testing.assert_array_equal(second[0].obs, sampler[2 * n].obs)
 
-    def test_loader_continues_with_the_next_pass_after_a_pass_is_left_early(self, sampler):
+    def test_loader_starts_the_next_pass_after_an_unfinished_pass(self, sampler):
         loader = torch_loader(sampler, start=2, stop=5)
         found = [next(iter(loader)).obs for _ in range(3)]
         for i, obs in zip((2, 5, 8), found, strict=True):

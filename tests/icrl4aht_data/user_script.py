@@ -1,4 +1,4 @@
-"""User script with Grain, PyTorch and JAX, which `test_shown.py` runs and `make check` type-checks."""
+"""Example of a user's script with Grain, PyTorch and JAX; `test_shown.py` runs it, and `make check` type-checks it."""
 
 # pyright: reportUnnecessaryTypeIgnoreComment=error
 

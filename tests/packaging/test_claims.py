@@ -90,7 +90,7 @@ def paper_plan_sizes() -> tuple[float, ...]:
 
 
 def range_over_layouts(count: Callable[[Layout], int]) -> tuple[int, int]:
-    """Count something on each published layout; return the smallest and the largest count."""
+    """Return the smallest and the largest value of `count` over all published layouts."""
     counts = [count(layout) for layout in LAYOUTS.values()]
     return min(counts), max(counts)
 
@@ -105,7 +105,10 @@ def tiny_model_size() -> tuple[int, int, int]:
 
 
 def count_test_behaviours() -> tuple[int, ...]:
-    """Return counts of test behaviours and test tasks, then behaviour counts of cells named in docs/protocol.md."""
+    """Return the numbers of test behaviours and test tasks, then three counts of behaviours of a family on a layout.
+
+    The three counts are for H1 on cramped_down, for H2 on test_wide, and for every other pair except pairs with H4.
+    """
     by_id = {task.task_id: task for task in bundled_tasks("test")}
     counts = Counter((task.layout.name, task.teammate_family) for task in by_id.values())
     for first, *others in same_behaviour_tasks():
@@ -186,8 +189,8 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
 """Page, text with {} for each number, and what computes these numbers."""
 
 
-def stated_numbers(page: str, claim: str) -> list[str]:
-    """Return the numbers that a page states in place of each {} of a claim; the claim must occur exactly once."""
+def numbers_in_page(page: str, claim: str) -> list[str]:
+    """Return the numbers that a page has at each {} of a claim; the page must contain the claim exactly once."""
     pattern = r"\s+".join(re.escape(word).replace(r"\{\}", NUMBER) for word in claim.split())
     found = list(re.finditer(pattern, (ROOT / f"{page}.md").read_text(encoding="utf-8")))
     assert len(found) == 1, f"{page}.md has {claim!r} {len(found)} times"
@@ -195,8 +198,8 @@ def stated_numbers(page: str, claim: str) -> list[str]:
 
 
 @pytest.mark.parametrize(("page", "claim", "compute"), CLAIMS, ids=[f"{page}: {claim}" for page, claim, _ in CLAIMS])
-def test_stated_numbers_equal_values_from_code_and_data(page, claim, compute):
-    stated, computed = stated_numbers(page, claim), compute()
+def test_numbers_in_pages_equal_values_from_code_and_data(page, claim, compute):
+    stated, computed = numbers_in_page(page, claim), compute()
     computed = computed if isinstance(computed, tuple) else (computed,)
     assert len(stated) == len(computed)
     for text, value in zip(stated, computed, strict=True):

@@ -70,7 +70,7 @@ def run_snippets(page: str, folder: Path) -> dict[str, Any]:
 
 
 def table_rows(page: str, heading: str) -> list[list[str]]:
-    """Return the rows of the Markdown table whose first column has this heading, as cells without backticks."""
+    """Return the rows of the Markdown table whose first column has the given heading, as cells without backticks."""
     (table,) = re.findall(rf"^\| {heading} \|.*?\n\|[-|]+\n((?:\|.*\n)+)", PAGES[page], flags=re.MULTILINE)
     return [[cell.strip().replace("`", "") for cell in line.strip("| ").split(" | ")] for line in table.splitlines()]
 
@@ -238,8 +238,8 @@ SMALL = "--steps 3 --width 16 --heads 2 --batch-size 2 --context 40"
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("example_package")
-def test_snippets_and_commands_of_the_extending_page_run(tmp_path, monkeypatch):
-    """Commands run without the method that a snippet registers, and use the objects of the example package."""
+def test_snippets_and_commands_in_extending_md_run(tmp_path, monkeypatch):
+    """The commands must find the method of the example package, so the method that a snippet registers is removed."""
     with mock.patch.dict(METHODS):
         names = run_snippets("extending", tmp_path)
     assert names["task"].teammate_family == "waiter"

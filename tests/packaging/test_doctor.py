@@ -45,7 +45,7 @@ def run_doctor(code: int = 0) -> tuple[dict[str, Any], str]:
 
 
 def reported_problems() -> dict[str, str]:
-    """Run `doctor`, which must find problems; return the next step for each problem."""
+    """Run `doctor`, which must find problems; return a dict from each problem to the advised next step."""
     return {each["problem"]: each["next_step"] for each in run_doctor(1)[0]["problems"]}
 
 
@@ -130,8 +130,8 @@ def test_doctor_reports_a_broken_jax(doctor_folder, monkeypatch):
     assert any("JAX cannot be used: ImportError: libcuda.so" in problem for problem in reported_problems())
 
 
-def test_install_hints_name_extras_that_contain_the_package(doctor_folder):
-    """Compare the constant EXTRAS with the metadata of the installed package."""
+def test_extras_in_install_hints_contain_their_library(doctor_folder):
+    """`EXTRAS` maps libraries to extras; the metadata of icrl4aht-data must list each library in its extra."""
     listed = [Requirement(line) for line in importlib.metadata.requires("icrl4aht-data") or []]
     for name, extra in EXTRAS.items():
         found = [one for one in listed if one.name == name and one.marker and one.marker.evaluate({"extra": extra})]

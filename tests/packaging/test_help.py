@@ -1,4 +1,4 @@
-"""Test the program's help: every command is listed, explained and found, and help imports no command."""
+"""Test the program's help and completion: every command has complete help, and help imports no command's module."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RESEARCH = "draws manifests diversity reference headroom proof"
 
 
 def find_command(verb: Verb) -> click.Command:
-    """Return the click command that the program registers for a verb."""
+    """Return the click command that runs when the program gets the words of `verb.name`."""
     command: click.Command | None = cli
     for word in verb.name.split():
         assert isinstance(command, VerbGroup)
@@ -76,7 +76,7 @@ def test_examples_in_help_are_valid(line):
 
 
 def bash_completions(*words: str) -> list[str]:
-    """Return the completions that the console script offers in bash after some words."""
+    """Return the completions that the console script offers in bash after the given words."""
     line = " ".join(("icrl4aht-data", *words))
     request = {"_ICRL4AHT_DATA_COMPLETE": "bash_complete", "COMP_WORDS": line, "COMP_CWORD": str(len(words))}
     path = Path(sys.executable).with_name("icrl4aht-data")

@@ -97,7 +97,7 @@ evaluate --agent stay --out e --layout cramped_up | no task on cramped_up in
 
 
 def parse_cases(text: str, code: int) -> Iterator[tuple[str, str, int]]:
-    """Yield the arguments, the expected message and the exit code of each line."""
+    """Yield arguments, expected message and `code` for each line of the form "arguments | message"."""
     for line in text.strip().splitlines():
         arguments, _, message = line.partition(" | ")
         yield arguments.replace("{MINI}", str(MINI)), message, code

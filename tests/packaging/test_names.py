@@ -27,7 +27,7 @@ def public_names(tree: ast.Module) -> Iterator[str]:
         elif isinstance(node, ast.Assign | ast.AnnAssign) and "TypeVar(" not in ast.unparse(node):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             found = [name for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
-            # Names that are only read are left out.
+            # The target `table[key]` reads the names `table` and `key`, and defines neither.
             names = [name.id for name in found if isinstance(name.ctx, ast.Store)]
         else:
             names = []

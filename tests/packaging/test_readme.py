@@ -18,12 +18,12 @@ CHARACTERS = 8000
 
 
 def code_blocks(language: str, page: str = README) -> list[str]:
-    """Return the code blocks of a page in one language."""
+    """Return the content of the code blocks in one language on a page."""
     return re.findall(rf"```{language}\n(.*?)```", page, flags=re.DOTALL)
 
 
 def shell_calls(page: str = README, program: str = "icrl4aht-data") -> list[list[str]]:
-    """Return the arguments of every call of a program in the shell blocks of a page."""
+    """Return the arguments of each line in a page's shell blocks that calls `program`."""
     lines = [line for block in code_blocks("sh", page) for line in block.splitlines() if line.startswith(program)]
     return [shlex.split(line, comments=True)[1:] for line in lines]
 

@@ -137,7 +137,7 @@ def sdist(build_requirements, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def wheel(build_requirements, sdist, tmp_path_factory) -> Path:
-    """Return the wheel, built from the source archive as for publication."""
+    """Return the path of the wheel, which is built from the unpacked source archive, not from the repository."""
     return build_archive(build_requirements, sdist, tmp_path_factory.mktemp("wheel"), "wheel")
 
 
@@ -237,7 +237,7 @@ def test_the_reader_works_without_extras(bare_environment, wheel, tmp_path):
     assert not list(tmp_path.glob("*.png"))
 
 
-def test_user_packages_with_equal_folder_names_do_not_break_commands(bare_environment, tmp_path):
+def test_user_packages_named_like_folders_of_the_project_do_not_break_commands(bare_environment, tmp_path):
     """A user's packages `baselines` and `generation` can be imported, and the command line still works."""
     for name in ("baselines", "generation"):
         (tmp_path / name).mkdir()
@@ -248,7 +248,7 @@ def test_user_packages_with_equal_folder_names_do_not_break_commands(bare_enviro
 
 
 def test_extras_named_in_messages_allow_training_and_drawing(jax_environment, wheel, tmp_path):
-    """The extra `jax` is enough to train and evaluate models; the install command that messages give adds drawing."""
+    """The extra `jax` is enough to train and evaluate models; drawing needs the install command shown in messages."""
     run = command_runner(jax_environment, tmp_path)
     run("python", "-c", EVALUATE)
     assert "ad-reference" in run("icrl4aht-data", "models")

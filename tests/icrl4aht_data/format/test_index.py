@@ -67,7 +67,7 @@ def test_index_lines_may_differ_in_json_formatting(long_release, read_changed_in
     ],
     ids=["empty", "two on one line", "one on two lines", "leading zero", "not finite"],
 )
-def test_index_line_without_exactly_one_object_raises_error(read_changed_index, change, number):
+def test_index_line_that_is_not_one_json_object_raises_error(read_changed_index, change, number):
     with pytest.raises(IndexFormatError, match=rf"histories\.jsonl, line {number}: "):
         read_changed_index(lambda lines: "".join(f"{line}\n" for line in change(lines)))
 

@@ -1,4 +1,4 @@
-"""Test releases that store their own layouts, and tasks whose recipes replace those of the layout."""
+"""Test releases that store their own layouts, and tasks that replace the recipes of their layout."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class TestReleaseWithLayouts:
         assert verify_release(root, level="deep").ok
 
     def test_commands_accept_names_of_release_layouts(self, root):
-        """Commands always know the package's layouts, and know the layouts of a release after reading the release."""
+        """Commands always accept the package's layouts; they accept layouts of a release after reading the release."""
         printed = run_cli("list", root, "--layout", "mine-3-5")
         assert "mine-3-5" in printed and "coord_simple" not in printed
         with pytest.raises(UnknownNameError, match="unknown layout 'nowhere'"):

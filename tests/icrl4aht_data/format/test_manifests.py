@@ -1,4 +1,4 @@
-"""Test task ids against the published ids, and bundled manifests against newly generated tasks."""
+"""Test that task ids equal the published ids, and that bundled manifests equal newly generated tasks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test additions of format version 4: oracle actions, independent learners, sources and left-out tasks."""
+"""Test additions of format version 4: oracle actions, independent learners, sources, tasks left out of a release."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_oracle_actions_learners_and_sources_round_trip(mixed_release):
     assert dataset.filter(source="noise").ids.tolist() == [0, 1, 10, 11]
 
 
-def test_deep_verification_lists_values_it_cannot_check(mixed_release, lite_release):
+def test_deep_verification_lists_unchecked_values(mixed_release, lite_release):
     report = verify_release(mixed_release[0], level="deep")
     assert report.ok, report.findings
     (note,) = report.notes
@@ -138,7 +138,7 @@ def test_published_files_omit_oracle_actions_and_learner_numbers(lite_release, t
         ),
     ],
 )
-def test_verify_finds_false_learners_sources_and_provenance(lite_release, tmp_path, name, change, message):
+def test_verify_finds_wrong_index_lines_and_provenance(lite_release, tmp_path, name, change, message):
     found = "\n".join(problems(spoiled_copy(lite_release, tmp_path / "release", name, change), "deep"))
     assert message in found
 
@@ -187,7 +187,7 @@ def test_conversions_keep_left_out_tasks(lite_release, tmp_path):
     set_left_out(tmp_path / "b", other)
     set_left_out(root, LEFT_OUT, other, replace(LEFT_OUT, task_id=made))
     combine_releases(tmp_path / "both", [root, tmp_path / "b"])
-    # `other` is listed once, and the task that has histories in the second release is not listed
+    # `other` is listed once as left out, and `made` is not listed, because the second release has its histories
     assert read_info(tmp_path / "both").left_out == [LEFT_OUT, other]
     assert verify_release(tmp_path / "both").ok
 

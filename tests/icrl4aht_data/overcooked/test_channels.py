@@ -1,4 +1,4 @@
-"""Test canonical channels: a layout's channels move to canonical positions, and all others are 0."""
+"""Test canonical channels: a layout's channels move to canonical positions, and all other canonical channels are 0."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from tests.helpers.states import random_records, state_record
 
 CRAMPED, RING, SIMPLE, WIDE = (LAYOUTS[name] for name in ("cramped_up", "coord_ring", "test_simple", "test_wide"))
 
-PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece of ingredient 0 and of ingredient 1
+PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO: one piece of ingredient 0, ONE: one piece of ingredient 1
 RECIPE_000, RECIPE_111 = 3 * ZERO, 3 * ONE
 
 SPECIFIED = {  # name: (alias, width, height, ingredient types, channels), from the specification

@@ -27,7 +27,7 @@ from tests.helpers.states import state_record
 
 CRAMPED, ASYMM, RING = (LAYOUTS[name] for name in ("cramped_up", "asymm_both", "coord_ring"))
 
-PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece of ingredient 0 and of ingredient 1
+PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO: one piece of ingredient 0, ONE: one piece of ingredient 1
 RECIPE_000, RECIPE_001, RECIPE_111 = 3 * ZERO, 2 * ZERO + ONE, 3 * ONE
 SOUP_000, SOUP_001, SOUP_111 = (recipe + COOKED for recipe in (RECIPE_000, RECIPE_001, RECIPE_111))
 DISH_000, DISH_001, DISH_111 = (soup + PLATE for soup in (SOUP_000, SOUP_001, SOUP_111))
@@ -39,8 +39,8 @@ AT_POT, AT_GOAL = (2, 1, "up"), (3, 2, "down")
 DELTA = {UP: (0, -1), DOWN: (0, 1), LEFT: (-1, 0), RIGHT: (1, 0)}
 
 
-class Scene(NamedTuple):
-    """State after a step as plain Python values, with the rewards of the step."""
+class Outcome(NamedTuple):
+    """State record after a step, its fields as plain Python values, and the rewards of the step."""
 
     record: np.ndarray
     hands: list[int]
@@ -52,11 +52,11 @@ class Scene(NamedTuple):
     shaped: list[float]
 
 
-def act(layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, next_recipe: int = RECIPE_111) -> Scene:
-    """Return the scene after one step; a correct delivery changes the recipe to `next_recipe`."""
+def act(layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, next_recipe: int = RECIPE_111) -> Outcome:
+    """Return the state and the rewards after one step; a correct delivery changes the recipe to `next_recipe`."""
     after = rules.step(layout, record, np.array([[ego, teammate]]), np.array([next_recipe], np.uint8))
     state = unpack(layout, after.state)
-    return Scene(
+    return Outcome(
         record=after.state,
         hands=state.hands[0].tolist(),
         recipe=int(state.recipe[0]),
@@ -73,15 +73,15 @@ def slot(request: pytest.FixtureRequest) -> int:
     return request.param
 
 
-def scene(slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Pose = ASIDE, **fields) -> np.ndarray:
-    """Return a state with one agent at pose `at` holding item `hand`, and the other agent out of the way."""
+def state_at(slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Pose = ASIDE, **fields) -> np.ndarray:
+    """Return a state record with agent `slot` at pose `at` with item `hand`, and the other agent at pose `aside`."""
     if slot == 0:
         return state_record(layout, at, aside, hands=[hand, 0], **fields)
     return state_record(layout, aside, at, hands=[0, hand], **fields)
 
 
-def interact(slot: int, record: np.ndarray, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111) -> Scene:
-    """Return the scene after one step in which agent `slot` interacts and the other agent stays."""
+def interact(slot: int, record: np.ndarray, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111) -> Outcome:
+    """Return the state and the rewards after a step in which agent `slot` interacts and the other agent stays."""
     ego, teammate = (INTERACT, STAY) if slot == 0 else (STAY, INTERACT)
     return act(layout, record, ego, teammate, next_recipe)
 
@@ -96,7 +96,7 @@ def test_action_ids_follow_the_order_of_the_paper():
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_agents_move_as_specified_from_every_pair_of_cells(layout):
-    """Compare with steps 1 to 3 of the specification, recomputed here in plain Python."""
+    """Compare with the movement rules of the specification, which this test repeats in plain Python."""
     cells, wanted_cells, actions = [], [], []
     starts = [pair for pair in product(*layout.rooms) if pair[0] != pair[1]]
     for old, pair in product(starts, product(range(6), repeat=2)):
@@ -124,7 +124,7 @@ def test_agents_move_as_specified_from_every_pair_of_cells(layout):
 
 
 def test_pot_with_three_ingredients_cooks_for_20_steps(slot):
-    record = scene(slot, AT_POT, ZERO)
+    record = state_at(slot, AT_POT, ZERO)
     for content in (ZERO, 2 * ZERO):
         after = interact(slot, record)
         assert (after.pots, after.hands) == ([(content, 0)], [0, 0])
@@ -145,7 +145,7 @@ def test_pot_with_three_ingredients_cooks_for_20_steps(slot):
 
 @pytest.mark.parametrize("next_recipe", [RECIPE_000, RECIPE_111])
 def test_a_correct_delivery_pays_20_and_changes_the_recipe(slot, next_recipe):
-    after = interact(slot, scene(slot, AT_GOAL, DISH_000, recipe=RECIPE_000), next_recipe=next_recipe)
+    after = interact(slot, state_at(slot, AT_GOAL, DISH_000, recipe=RECIPE_000), next_recipe=next_recipe)
     assert (after.reward, after.shaped, after.hands) == (20, [0, 0], [0, 0])
     assert (after.recipe, after.delivered) == (next_recipe, 1)  # the next recipe may equal the delivered recipe
     later = act(CRAMPED, after.record, STAY, next_recipe=RECIPE_001)
@@ -154,7 +154,7 @@ def test_a_correct_delivery_pays_20_and_changes_the_recipe(slot, next_recipe):
 
 @pytest.mark.parametrize(("recipe", "dish"), [(RECIPE_000, DISH_111), (RECIPE_111, DISH_000), (RECIPE_000, DISH_001)])
 def test_a_wrong_delivery_costs_20_and_keeps_the_recipe(slot, recipe, dish):
-    after = interact(slot, scene(slot, AT_GOAL, dish, recipe=recipe), next_recipe=RECIPE_001)
+    after = interact(slot, state_at(slot, AT_GOAL, dish, recipe=recipe), next_recipe=RECIPE_001)
     assert (after.reward, after.shaped, after.hands) == (-20, [0, 0], [0, 0])
     assert (after.recipe, after.delivered) == (recipe, 0)
 
@@ -165,12 +165,12 @@ AT_BUTTON = ((4, 1, "down"), (4, 3, "up"))
 FAR = ((1, 4, "up"), (3, 5, "up"))
 
 
-def ring_scene(slot: int, hand: int = 0, **fields) -> np.ndarray:
-    return scene(slot, AT_BUTTON[slot], hand, layout=RING, aside=FAR[1 - slot], **fields)
+def ring_state(slot: int, hand: int = 0, **fields) -> np.ndarray:
+    return state_at(slot, AT_BUTTON[slot], hand, layout=RING, aside=FAR[1 - slot], **fields)
 
 
 def test_button_press_costs_5_and_shows_the_recipe_for_9_observations(slot):
-    record = ring_scene(slot, recipe=RECIPE_000)
+    record = ring_state(slot, recipe=RECIPE_000)
     row = 3 if slot == 0 else 1
     recipe_channel = 2 * 10 + 6 + 3 + 5 + 2  # channel of ingredient 0 of the recipe, for three ingredient types
     after = interact(slot, record, RING)

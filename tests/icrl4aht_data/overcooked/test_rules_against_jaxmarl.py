@@ -1,4 +1,4 @@
-"""Differential test: steps, rewards and observations equal those of JaxMARL from equal states."""
+"""Test that states, rewards and observations after a step equal those of JaxMARL for equal states and actions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.helpers.states import random_records
 BATCH, STEPS, SCENES = 512, 20, 20  # 10,240 steps of trajectories, then 10,240 single steps from random states
 
 
-DEFAULT = ("coord_ring",)  # this layout has buttons; the other layouts run only among the slow tests
+DEFAULT = ("coord_ring",)  # a layout with buttons; tests of all other layouts are marked as slow
 
 
 @pytest.mark.parametrize(

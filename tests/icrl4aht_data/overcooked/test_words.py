@@ -1,4 +1,4 @@
-"""Test words, integers that encode the content of a visible cell, against the channels that `observe` returns."""
+"""Test `cell_words`, which encodes each visible cell as an integer, against the channels that `observe` returns."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_channels_of_words_equal_the_observation(layout, agent):
 
 
 @each_layout
-def test_entries_include_all_nonzero_values_of_observations(layout):
+def test_word_entries_include_every_nonzero_entry_of_observations(layout):
     records, words = example_records(layout), cell_words((layout,))
     seen = [np.flatnonzero(observe(layout, records, agent).reshape(len(records), -1).any(axis=0)) for agent in (0, 1)]
     assert np.isin(seen[0], words.entries((0,))).all()

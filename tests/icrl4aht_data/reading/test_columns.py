@@ -1,4 +1,4 @@
-"""Test index columns, data frames, filters, counts, and warnings about labels of a policy that earns little."""
+"""Test index columns, data frames, filters, counts, and warnings about labels of an expert with low returns."""
 
 from __future__ import annotations
 

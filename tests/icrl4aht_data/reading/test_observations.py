@@ -174,7 +174,7 @@ class TestFaultyFiles:
 
 
 class TestTasks:
-    def test_teammates_without_tasks_are_known_by_name_only(self, converted_release):
+    def test_release_without_tasks_has_only_names_of_teammates(self, converted_release):
         dataset = load_icrl4aht(converted_release)
         assert (converted_release / TASKS).read_text() == ""
         assert {entry.seed for entry in dataset.entries} == {-1}
@@ -222,7 +222,7 @@ class TestMissingStates:
             mixed = load_icrl4aht(converted_release, layout="demo_wide", cache=cache)
             assert mixed.ad(batch_size=9, length=5)[0].prev_teammate_actions is None
 
-    def test_column_has_teammate_actions_is_read_from_a_large_index(self, tmp_path):
+    def test_has_teammate_actions_column_is_read_from_a_large_index(self, tmp_path):
         write_long_index(tmp_path / "r")
         has = [number % 3 > 0 for number in range(3000)]
         change = {number: {"has_teammate_actions": value} for number, value in enumerate(has)}
@@ -277,7 +277,7 @@ class TestBatches:
         with pytest.raises(LabelsMissingError, match="labels = expert: 1 of 1 histories have no expert actions"):
             load_icrl4aht(converted_release, task_id="task_b").dpt(batch_size=2, context=5)
 
-    def test_position_saved_with_other_excluded_steps_is_refused(self, lite, reconverted_release):
+    def test_position_saved_by_a_sampler_with_other_excluded_steps_is_refused(self, lite, reconverted_release):
         roots = lite[0], reconverted_release
         one, two = (load_icrl4aht(root, layout="demo_wide").dpt(batch_size=2, context=5) for root in roots)
         with one.batches() as batches, pytest.raises(OptionError, match="excluded"):

@@ -96,7 +96,7 @@ def test_exception_while_prefetching_is_raised_in_the_consumer(release_copy, pre
     assert next(batches, None) is None
 
 
-def test_closing_or_deleting_batches_ends_their_thread(sampler):
+def test_closing_or_deleting_batches_ends_the_prefetch_thread(sampler):
     def prefetch_threads() -> int:
         return sum(thread.name.startswith("icrl4aht-prefetch") for thread in threading.enumerate())
 
@@ -154,7 +154,7 @@ def test_position_saved_before_an_option_existed_can_be_resumed(two_sources):
         assert_equal_batches(next(batches), sampler[7])
 
 
-def test_batches_can_be_pickled_before_the_first_batch(lite):
+def test_batch_iterator_can_be_pickled_before_its_first_batch(lite):
     batches = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=2, length=10, seed=0).batches()
     assert_equal_batches(next(pickle.loads(pickle.dumps(batches))), next(batches))
 

@@ -59,14 +59,14 @@ def test_windows_contain_only_every_nth_episode(two_sources, cache, every):
 
 
 def test_all_starts_of_windows_are_drawn(two_sources):
-    """With `every` = 2, six episodes form two sequences of three episodes; windows can start at 14 steps of each."""
+    """With `every` = 2, six episodes form two sequences of three; windows start at the first 14 steps of a sequence."""
     sampler = load_icrl4aht(two_sources[0], layout="demo_wide", split="train").ad(every=2, **OPTIONS)
     starts = np.concatenate([sampler.windows(i)[1] for i in range(40)])
     assert set(starts.tolist()) == {*range(14), *range(LENGTH, LENGTH + 14)}
 
 
 def test_every_option_respects_episode_range_and_curriculum(two_sources):
-    """The episode range is the last four of six episodes; batch 0 starts in its first half, episodes 2 and 3."""
+    """Windows are drawn from the last four of six episodes; all windows of batch 0 start in episodes 2 and 3."""
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
     parts = dataset.ad(every=2, episodes=(-4, None), curriculum=Curriculum(9, (0, 0.5), (0.5, 1)), **OPTIONS)
     for i, first in ((0, 2), (9, 4), (50, 4)):

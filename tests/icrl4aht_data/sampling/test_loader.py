@@ -22,7 +22,7 @@ LAYOUTS = ("coord_simple", "demo_simple", "coord_ring")
 
 @pytest.fixture(scope="module")
 def three_layouts(tmp_path_factory):
-    """Return a folder with a release of three layouts and a copy without states, and the written arrays."""
+    """Return a folder with two releases of the same histories on three layouts, one without states; also the arrays."""
     root = tmp_path_factory.mktemp("three")
     written = random_release(root / "states", layouts=LAYOUTS, teammates=1)
     to_release(load_icrl4aht(root / "states"), root / "observations", "observations")
@@ -172,7 +172,7 @@ class TestOptions:
                     np.testing.assert_array_equal(np.concatenate([getattr(batch, name) for batch in batches]), array)
 
     def test_windows_are_uniform_over_histories_and_starts(self, lite):
-        """Compare Pearson's statistic of 60,000 draws with its expected mean, within five standard deviations."""
+        """Pearson's chi-squared statistic of 60,000 draws must be within five standard deviations of its mean."""
         sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=500, length=20, seed=11)
         cells = np.zeros((6, 101))
         for i in range(120):

@@ -1,4 +1,4 @@
-"""Test that batches equal parts of the histories, and that the draws of a seed never change."""
+"""Test that batches contain unchanged steps of the histories, and that the draws of a seed never change."""
 
 from __future__ import annotations
 

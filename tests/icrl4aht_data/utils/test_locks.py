@@ -1,4 +1,4 @@
-"""Test that file locks exclude other holders although the lock file is removed after use."""
+"""Test that a file lock has one holder at a time although the lock file is removed after use."""
 
 from __future__ import annotations
 

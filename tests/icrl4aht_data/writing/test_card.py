@@ -57,7 +57,7 @@ def four_tasks() -> Tasks:
 
 @pytest.fixture
 def write_meta(lite, tmp_path) -> Callable[..., dict[str, Any]]:
-    """Return a function that writes meta/ of a release and returns the card's values; `change` edits provenances."""
+    """Return a function that writes the folder meta/, with provenances edited by `change`, and returns card values."""
     like = read_index(lite[0]).entries[0]
 
     def write_meta(tasks: Tasks | None = None, change: Change = lambda of: of, **fields: Any) -> dict[str, Any]:

@@ -41,7 +41,7 @@ def stream_episodes(built_release: Path, split: str) -> Any:
 
 
 def episodes_in_file_order(dataset: Dataset, split: str) -> list[tuple[History, Episode]]:
-    """Return the episodes of a split with their histories, ordered by layout name like the files."""
+    """Return pairs of history and episode of a split in the order of the files: sorted by layout name."""
     layouts = sorted(layout.name for layout in dataset.filter(split=split).layouts)
     parts = [dataset.filter(split=split, layout=name) for name in layouts]
     return [(history, episode) for part in parts for history in part for episode in history.episodes]

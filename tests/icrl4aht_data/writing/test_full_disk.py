@@ -18,7 +18,7 @@ needs_disks = pytest.mark.skipif(not can_mount(), reason="this user may not moun
 
 
 def test_file_size_limit_raises_error_with_the_file_name(lite, tmp_path):
-    """libhdf5 may crash when a file cannot be closed, so shards are written without libhdf5."""
+    """libhdf5 may crash when a file cannot be closed, so shards are made in memory and written without libhdf5."""
     dataset = load_icrl4aht(lite[0])
     for limit in (PAGE, 10 * PAGE):
         with file_size_limit(limit), pytest.raises(OSError, match=r"File too large.*histories\.h5") as error:
@@ -46,7 +46,7 @@ def test_full_disk_raises_error_that_names_the_disk(lite, tmp_path):
 
 
 def test_shards_equal_files_written_by_libhdf5(lite, tmp_path, monkeypatch):
-    """Shards made in memory must equal those written to disk by older versions."""
+    """Shards made in memory must have the same bytes as shards that libhdf5 writes directly to disk."""
     real = h5py.File
     to_release(load_icrl4aht(lite[0]), tmp_path / "memory", "full")
     assert verify_release(tmp_path / "memory").ok

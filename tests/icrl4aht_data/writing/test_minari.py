@@ -20,7 +20,7 @@ EPISODES, STEPS = 6, 20
 
 @pytest.fixture(scope="module")
 def minari_folder(lite, tmp_path_factory):
-    """Return the folder of a Minari dataset of the release `lite`, on two layouts of unequal observation shapes."""
+    """Return the folder of `lite` as a Minari dataset; the release has two layouts with unequal observation shapes."""
     folder = tmp_path_factory.mktemp("minari")
     return to_minari(load_icrl4aht(lite[0]), folder / "lite-v0")
 

@@ -55,7 +55,7 @@ def test_family_names_of_the_published_code_are_converted(published_folder, tmp_
 
 @pytest.fixture(scope="module")
 def short_views(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]], np.ndarray]:
-    """Return files with observations of 4 x 5 cells of cramped_up, the histories, and the complete observations."""
+    """Return published files with views of 4 x 5 cells on cramped_up, the written arrays, and views of 5 x 5 cells."""
     folder = tmp_path_factory.mktemp("short")
     written = random_release(folder / "release", layouts=("cramped_up",), teammates=1, streams=2)
     dataset = load_icrl4aht(folder / "release", obs="uint8")
@@ -92,7 +92,7 @@ def test_short_views_are_padded_to_5_by_5(short_views, tmp_path):
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
 def test_short_views_are_completed_from_states(short_views, tmp_path, kind):
-    """Missing rows of cells are rendered from states, and changed rows are found."""
+    """Missing cells are rendered from state records; observations that differ from the rendered ones are refused."""
     files, _, complete = short_views
     shutil.copytree(files, tmp_path / "files")
     dataset = load_icrl4aht(files.parent / "release")

@@ -1,4 +1,4 @@
-"""Test writing releases: round trips with our reader, and no readable release after interrupted writing."""
+"""Test writing releases: round trips with our reader, refused inputs, and interrupted writing."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def write_cramped_up_release(
 
 
 def random_arrays() -> dict[str, np.ndarray]:
-    """Return the arrays of one history of 5 episodes of 10 steps on cramped_up."""
+    """Return the arrays of one history on cramped_up with 5 episodes of 10 steps."""
     return random_history(get_layout("cramped_up"), 5, 10, np.random.default_rng(0))
 
 

@@ -57,7 +57,7 @@ def add_line(name: str) -> Spoil:
 
 
 def replace_file(name: str | Callable[[Path], str], make: Make) -> Spoil:
-    """Return a function that replaces a file or folder by the one that `make` creates."""
+    """Return a function that removes a file or folder and calls `make` to create something in its place."""
 
     def replace_path(root: Path) -> None:
         path = root / (name if isinstance(name, str) else name(root))
@@ -99,7 +99,7 @@ def deep_json(levels: int) -> Make:
 
 
 def change_json(name: str, change: Callable[[Any], Any]) -> Spoil:
-    """Return a function that applies `change` to the content of a JSON file, in place or with a new value as result."""
+    """Return a function that rewrites a JSON file; `change` edits the content in place or returns new content."""
 
     def rewrite_json(root: Path) -> None:
         value = json.loads((root / name).read_text())
@@ -110,7 +110,7 @@ def change_json(name: str, change: Callable[[Any], Any]) -> Spoil:
 
 
 def change_lines(change: Callable[[list[dict[str, Any]]], list | None], name: str = HISTORIES) -> Spoil:
-    """Return a function that applies `change` to the lines of a JSONL file, in place or with new lines as result."""
+    """Return a function that rewrites a JSONL file; `change` edits the lines in place or returns new lines."""
 
     def rewrite_lines(root: Path) -> None:
         values = [json.loads(line) for line in (root / name).read_text().splitlines()]
@@ -149,7 +149,7 @@ def set_theta(**changes: Any) -> Spoil:
 
 
 def change_table(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
-    """Return a function that applies `change` to the shard's chunk table, in place or with a new table as result."""
+    """Return a function that rewrites the chunk table; `change` edits the table in place or returns a new table."""
 
     def rewrite_table(root: Path) -> None:
         rows = np.load(root / TABLE)
@@ -191,7 +191,7 @@ def actions_dataset(shape: tuple[int, ...] = (4, 120), dtype: Any = "i1", **opti
 
 
 def actions_of_type(dtype: Any) -> ChangeFile:
-    """Return a function that replaces the actions by values of another type."""
+    """Return a function that replaces the actions by a dataset of the given type."""
     return actions_dataset(dtype=dtype, chunks=(1, 120), compression="gzip")
 
 
@@ -220,7 +220,7 @@ CASES: dict[str, Case] = {}
 
 
 def add_cases(kind: str, message: str, spoils: Mapping[str, Spoil]) -> None:
-    """Add test cases of one kind that must report the same message."""
+    """Add hostile inputs of one kind that must be reported with the same message."""
     for name, spoil in spoils.items():
         add_case(f"{kind}: {name}", Case(kind, message, spoil))
 
@@ -350,7 +350,7 @@ def archived_table(path: Path, root: Path) -> None:
 
 
 def gigabyte_of_zeros() -> bytes:
-    """Return a gigabyte of zeros, compressed by DEFLATE in parts of 16 MiB; parts 2 to 64 have equal bytes."""
+    """Return a gigabyte of zeros in zlib format: a first block of 16 MiB, then 63 copies of one compressed block."""
     compressor = zlib.compressobj(9)
     first, part = (compressor.compress(bytes(2**24)) + compressor.flush(zlib.Z_FULL_FLUSH) for _ in range(2))
     checksum = (2**30 % 65521) << 16 | 1  # Adler-32 checksum of a gigabyte of zeros

@@ -84,7 +84,7 @@ def file_states(folder: Path) -> dict[str, tuple]:
 
 
 def run_step(step: Callable[[], Any]) -> dict[str, Any]:
-    """Run an operation; return its output or error message, and whether it raised only package errors."""
+    """Run an operation; return its output or error message, and False for an error that is no `Icrl4ahtError`."""
     try:
         with time_limit(SECONDS):
             ours, text = True, str(step() or "")
@@ -151,7 +151,7 @@ def case_steps(case: Case, root: Path, out: Path) -> Steps:
 
 
 def run_in_folder(folder: Path, base: Path, case: Case) -> dict[str, Any]:
-    """Run all operations of a case; return their outcomes, changes of input files, leaks and written bytes."""
+    """Run all operations of a case; return outcomes, whether input files changed, leaks, and the bytes written."""
     folder.mkdir()
     root, out = folder / "root", folder / "out"
     shutil.copytree(base, root)
@@ -176,7 +176,7 @@ def _contains_secret(path: Path) -> bool:
 
 
 def make_valid_inputs(folder: Path) -> None:
-    """Write a valid release and valid published files; hostile cases damage copies of these."""
+    """Write the valid release and the valid published files that hostile cases copy and damage."""
     make_release(folder / "release")
     to_published(load_icrl4aht(folder / "release"), folder / "published")
 
