@@ -49,13 +49,13 @@ def _resource_limit(kind: int, value: int) -> Iterator[Callable[[], None]]:
 
 
 def memory_limit(size: int) -> AbstractContextManager[object]:
-    """Make allocations fail that need more than `size` bytes beyond the address space in use."""
+    """Allow this process at most `size` more bytes of address space; allocations beyond this limit fail."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     return _resource_limit(resource.RLIMIT_AS, used + size)
 
 
 def file_size_limit(size: int) -> AbstractContextManager[Callable[[], None]]:
-    """Make writes fail beyond `size` bytes of a file, like a quota; yield a function that removes the limit."""
+    """Limit each file written by this process to `size` bytes; yield a function that removes the limit."""
     return _resource_limit(resource.RLIMIT_FSIZE, size)
 
 
@@ -84,8 +84,8 @@ def can_mount() -> bool:
         return False
 
 
-_CAPABILITIES = 1 << 1 | 1 << 2  # CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH, which ignore file permissions
-_VERSION = 0x20080522  # version of the structures of capget and capset
+_CAPABILITIES = 1 << 1 | 1 << 2  # CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH, which let a process bypass file permissions
+_VERSION = 0x20080522  # _LINUX_CAPABILITY_VERSION_3, an argument of capget and capset
 
 
 @contextmanager

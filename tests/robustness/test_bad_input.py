@@ -1,4 +1,4 @@
-"""Test that damaged files and wrong options raise package errors, never errors of other libraries."""
+"""Test that reading a damaged release raises package errors, never errors of other libraries."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_damaged_chunk_table_raises_error(release_copy):
         read_all(release_copy)
 
 
-def test_all_error_classes_have_a_common_base():
+def test_error_classes_are_package_errors_or_warnings():
     classes = [c for c in vars(errors).values() if isinstance(c, type) and c.__module__ == errors.__name__]
     assert len(classes) > 10
     assert all(issubclass(c, (Icrl4ahtError, Warning)) for c in classes)

@@ -1,4 +1,4 @@
-"""Test faults of disks, processes and files: reads return correct data or package errors, and retries succeed."""
+"""Test that faults of disks, processes and files cause errors but never wrong data, and that retries succeed."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ def cache_folder(tmp_path, monkeypatch) -> Path:
     return tmp_path / "cache"
 
 
-class DamagedCopy:
-    """A small release, in which tests damage files, and the data read before any damage."""
+class SmallRelease:
+    """A small release in which tests damage files; `before` is the result of `read` without damage."""
 
     def __init__(self, root: Path) -> None:
         random_release(root, teammates=2, streams=1, episodes=6, length=15)
@@ -96,7 +96,7 @@ class DamagedCopy:
 
     @contextmanager
     def damaged(self, path: Path, data: bytes) -> Iterator[None]:
-        """Replace the content of a file during a block, but keep its timestamps."""
+        """Replace a file's content within the context, but keep the file's timestamps."""
         right, status = path.read_bytes(), path.stat()
         path.write_bytes(data)
         os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
@@ -113,8 +113,8 @@ class DamagedCopy:
 
 
 @pytest.fixture(scope="module")
-def small_release(tmp_path_factory) -> DamagedCopy:
-    return DamagedCopy(tmp_path_factory.mktemp("small") / "release")
+def small_release(tmp_path_factory) -> SmallRelease:
+    return SmallRelease(tmp_path_factory.mktemp("small") / "release")
 
 
 @pytest.mark.parametrize("count", [9, pytest.param(90, marks=SLOW)])
@@ -153,7 +153,7 @@ def mutate(data: bytes, rng: np.random.Generator) -> bytes:
 @pytest.mark.parametrize("name", [HISTORIES, INFO, MANIFEST, TASKS, PROVENANCE])
 @pytest.mark.parametrize("count", [1, pytest.param(10, marks=SLOW)])
 def test_mutated_text_files_raise_only_package_errors(small_release, cache_folder, tmp_path, name, count):
-    """Read each mutated file with the old manifest, then with a matching manifest."""
+    """Read a mutated file with the old manifest, then with a matching manifest; download a mutated manifest."""
     path, rng = small_release.root / name, np.random.default_rng(count)
     for number in range(count):
         data = mutant = path.read_bytes()

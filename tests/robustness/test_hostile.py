@@ -1,6 +1,6 @@
-"""Test that hostile releases, published files and servers cause package errors or findings that name the fault.
+"""Test that hostile releases, servers and files of the published code cause package errors or findings.
 
-All cases run in one separate process with bounded memory, see `hostile.run`.
+The errors and findings name the fault. All cases run in one separate process with bounded memory, see `hostile.run`.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ class Faults:
             return next((fault for rule in self._rules if (fault := rule(request)) is not None), None)
 
     def add(self, rule: Rule) -> None:
-        """Add a rule, a function that returns the fault of a request or None; calls are locked, so a rule may count."""
+        """Add a rule that returns the fault for a request, or None; calls are locked, so a rule may count requests."""
         with self._lock:
             self._rules.append(rule)
 

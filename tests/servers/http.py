@@ -170,7 +170,7 @@ def _open_body(body: bytes | Path) -> BinaryIO:
 
 @contextmanager
 def http_server(folder: Path, faults: Faults | None = None) -> Iterator[Server]:
-    """Serve the files of a folder, without listings of folders; yield the server."""
+    """Serve the files of a folder, without directory listings; yield the server."""
     root = folder.resolve()
 
     def route(request: Request, body: bytes) -> Answer:

@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit
 
 from tests.servers.faults import Faults, Request
 from tests.servers.http import Answer, Server
-from tests.servers.hub_repos import HubError, HubState, Repo, is_large
+from tests.servers.hub_repos import HubError, HubState, Repo, uses_lfs
 from tests.servers.hub_routes import ROUTES, HubRequest
 from tests.servers.process import hub_environment, hub_settings
 
@@ -43,7 +43,7 @@ class Hub(HubState):
             for path in folder.rglob("*"):
                 if path.is_file():
                     name = path.relative_to(folder).as_posix()
-                    files[name] = self.blobs.add(path.read_bytes(), is_large(name, path.stat().st_size))
+                    files[name] = self.blobs.add(path.read_bytes(), uses_lfs(name, path.stat().st_size))
             commit = repo.commit("main", files)
             if tag is not None:
                 repo.tags[tag] = commit.oid
@@ -86,7 +86,7 @@ class Hub(HubState):
 
 @contextmanager
 def hub_server(root: Path) -> Iterator[Hub]:
-    """Run an empty test Hub, and direct huggingface_hub in this process to this Hub within the context.
+    """Run an empty test Hub; within the context, huggingface_hub in this process connects to this Hub.
 
     Args:
         root: empty folder for contents and for the client's caches.

@@ -56,7 +56,7 @@ class File:
     def entry(self, path: str) -> dict:
         """Return the file's entry in a listing of the repository."""
         entry: dict = {"type": "file", "oid": self.oid, "size": self.size, "path": path}
-        pointer = {"oid": self.sha256, "size": self.size, "pointerSize": len(_pointer(self.sha256, self.size))}
+        pointer = {"oid": self.sha256, "size": self.size, "pointerSize": len(_lfs_pointer(self.sha256, self.size))}
         return entry | ({"lfs": pointer} if self.lfs else {})
 
 
@@ -109,25 +109,25 @@ class Blobs:
         return self._root / sha256
 
     def add(self, data: bytes, lfs: bool) -> File:
-        """Store the content of a file, and return the record of the file that a commit contains."""
+        """Store the content of a file, and return the `File` to list in a commit."""
         sha256 = hashlib.sha256(data).hexdigest()
         if not self.path(sha256).exists():  # do not overwrite a file that a client may be downloading
             self.path(sha256).write_bytes(data)
         return self.file(sha256, lfs)
 
     def file(self, sha256: str, lfs: bool) -> File:
-        """Return the record of a stored file that a commit contains."""
+        """Return the `File` to list in a commit, for content that is already stored."""
         size = self.path(sha256).stat().st_size
-        in_git = _pointer(sha256, size) if lfs else self.path(sha256).read_bytes()
+        in_git = _lfs_pointer(sha256, size) if lfs else self.path(sha256).read_bytes()
         return File(sha256, size, hashlib.sha1(b"blob %d\0" % len(in_git) + in_git).hexdigest(), lfs)
 
 
-def is_large(path: str, size: int) -> bool:
+def uses_lfs(path: str, size: int) -> bool:
     """Return whether the Hub stores a file by LFS, outside git."""
     return size > 0 and (size >= LFS_BYTES or Path(path).suffix in LFS_SUFFIXES)
 
 
-def _pointer(sha256: str, size: int) -> bytes:
+def _lfs_pointer(sha256: str, size: int) -> bytes:
     return f"version https://git-lfs.github.com/spec/v1\noid sha256:{sha256}\nsize {size}\n".encode()
 
 

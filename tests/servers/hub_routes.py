@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from tests.servers.faults import Request
 from tests.servers.http import Answer
-from tests.servers.hub_repos import LFS_SUFFIXES, File, HubError, HubState, Repo, is_large
+from tests.servers.hub_repos import LFS_SUFFIXES, File, HubError, HubState, Repo, uses_lfs
 
 REPO = r"/api/datasets/(?P<id>[^/]+/[^/]+)"
 AT = r"/(?P<revision>[^/]+)"
@@ -119,12 +119,12 @@ def create_repo(call: HubRequest) -> Answer:
 
 
 def preupload(call: HubRequest) -> Answer:
-    """Answer which of the announced files to upload by LFS, and with the hashes of files that already exist."""
+    """Answer with the upload mode of each announced file, and with the hash of any existing file at the same path."""
     call.require_token()
     commit, listed = call.repo.resolve(call.names["revision"]), []
     for announced in call.json()["files"]:
         path = announced["path"]
-        mode = "lfs" if is_large(path, announced["size"]) else "regular"
+        mode = "lfs" if uses_lfs(path, announced["size"]) else "regular"
         file = {"path": path, "shouldIgnore": False, "uploadMode": mode}
         if path in commit.files:
             known = commit.files[path]
@@ -156,13 +156,13 @@ def commit(call: HubRequest) -> Answer:
             if not head.oid.startswith(operation["value"].get("parentCommit") or ""):
                 raise HubError(412, "A commit has happened since. Please refresh and try again.")
         else:
-            _apply(call.hub, files, operation["key"], operation["value"])
+            _apply_operation(call.hub, files, operation["key"], operation["value"])
     oid = repo.commit(branch, files).oid
     return json_answer({"success": True, "commitOid": oid, "commitUrl": f"{call.url}/commit/{oid}", "hookOutput": ""})
 
 
-def _apply(hub: HubState, files: dict[str, File], key: str, value: dict) -> None:
-    """Apply one operation of a commit request to the files of a commit: "file", "lfsFile" or "deletedFile"."""
+def _apply_operation(hub: HubState, files: dict[str, File], key: str, value: dict) -> None:
+    """Apply an operation, "file", "lfsFile" or "deletedFile", of a commit request to the files of the new commit."""
     path = value["path"].strip("/")
     if key == "file":
         content = base64.b64decode(value["content"], validate=True)
