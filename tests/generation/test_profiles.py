@@ -314,7 +314,7 @@ H3 = 'families = ["assembly_line"]'
         ("minibatches = 4", "minibatches = 3", "minibatches = 3"),
         ("presets =", 'sources = ["ppo", "nois"]\npresets =', "nois"),
         ("presets =", 'sources = ["ppo", "search"]\npresets =', r"tasks\.preference = \[\]"),
-        ("presets =", 'preference = ["all"]\npresets =', r"tasks\.preference = \['all'\].*expected .* contains search"),
+        ("presets =", 'preference = ["all"]\npresets =', r"tasks\.preference = \['all'\].*source search needs"),
         ("presets =", 'algorithms = { cramped_up = ["fcp", "fcp"] }\npresets =', "cramped_up"),
         ("[release]", "[noise]\nend = [0.3, 0.1]\n[release]", "end"),
         ("[release]", "[noise]\nbegin = [0, 0.7]\nfinish = 0.5\n[release]", "begin"),

@@ -77,7 +77,7 @@ def test_provenance_names_the_agent_and_tasks_without_oracle_labels(release, dat
     assert found.counts("label_view") == {"ego": len(found)}
     without = found.column("task_id") == teammates.tasks[1].task_id
     assert (found.has_labels("oracle") == ~without).all() and without.sum() == 2
-    with pytest.raises(LabelsMissingError, match=f"of 1 task .*of task {teammates.tasks[1].task_id}"):
+    with pytest.raises(LabelsMissingError, match=f"in 1 task .*of task {teammates.tasks[1].task_id}"):
         found.filter(split="train").ad(batch_size=1, length=10, labels="oracle")
     assert {task.teammate_key for task in made} == {task.teammate_key for task in given}
     assert not set(found.column("task_id")) & set(dataset.column("task_id"))

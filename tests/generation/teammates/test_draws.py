@@ -164,7 +164,7 @@ def test_draws_without_headroom_are_left_out_if_other_draws_have_headroom(monkey
     flat, wide = draw(H1, 0, oracle=5.9), draw(H1, 1, oracle=6.0)
     use_table(monkeypatch, tmp_path, flat, wide, draw(H3, 0, oracle=5.9))
     assert chosen_draws([H1], 1) == [(H1, 1)]
-    with pytest.raises(OptionError, match=f"{H3}: with none of the 1 draws .* differ by 4.9 .*differ by 5 or more"):
+    with pytest.raises(OptionError, match=f"of {H3}: none of the 1 draws .* differ by 4.9 .*differ by 5 or more"):
         drawn_teammates("demo_wide", [H3], 1)
     use_table(monkeypatch, tmp_path, flat, replace(wide, distance=0.01), draw(H3, 0, oracle=5.9))
     assert chosen_draws([H1, H3], 2) == [(H1, 0), (H3, 0)]

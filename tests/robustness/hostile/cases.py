@@ -294,7 +294,8 @@ add_cases("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes":
 add_hashed_cases("matching regex", {"checkpoint's hash": set_theta(sha256="../../outside")})
 _paths = {"above": "../../outside", "absolute": "/etc", "backslash": "..\\..\\outside", "surrogate": "\ud800"}
 add_hashed_cases(
-    "expected a path within", {f"checkpoint path: {name}": set_theta(checkpoint=path) for name, path in _paths.items()}
+    "expected a path in the teammate suite",
+    {f"checkpoint path: {name}": set_theta(checkpoint=path) for name, path in _paths.items()},
 )
 
 # Cases of extreme numbers, sizes and texts
