@@ -15,7 +15,7 @@ from icrl4aht_generation.teammates.spread import find_measured
 
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
-from icrl4aht_baselines.online.rl2 import PlayTask, PlayTrainer, make_group, make_groups
+from icrl4aht_baselines.online.rl2 import PlayTask, PlayTrainer, make_group, make_play_tasks
 from icrl4aht_baselines.online.teammates import tasks_on_layouts
 from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cell, training_cells
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
@@ -76,14 +76,13 @@ def prepare_play(
     # Channels are canonical, because one network plays on all layouts.
     method = get_method(name)(model, overcooked_world(layouts, model.encoder, canonical=True))
     hidden = [get_layout(one).name for one in histories.hide_recipe]
-    groups = _task_groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
-    # With few tasks, some teammates are in no group, so the record of training data must not state them.
-    fixed = {layout for layout, _ in teammates if _fixes_dish(layout)}
     # In tasks with a fixed dish that no indicator shows, the model imitates the script `search`.
+    fixed = {layout for layout, _ in teammates if _fixes_dish(layout)}
+    searched = {layout for layout in fixed if layout.name in hidden or not layout.shows_recipe}
+    # With few tasks, some teammates have none, so the record of training data must not state them.
     played = [
-        task._replace(searched=task.layout in fixed and (task.hidden or not task.layout.shows_recipe))
-        for group in groups
-        for task in group
+        task._replace(searched=task.layout in searched)
+        for task in _training_tasks(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
     ]
     # Actions of the script `search` also count as "oracle", because `search` is an oracle that believes in a recipe.
     labels: Labels | None = "oracle" if play.imitation else None
@@ -166,10 +165,10 @@ def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
         )
 
 
-def _task_groups(
+def _training_tasks(
     teammates: _Teammates, shares: Mapping[str, float], hidden: Sequence[str], play: PlayOptions, tasks: int
-) -> list[list[PlayTask]]:
-    """Return groups of training tasks, also on other versions of the layouts if `play` requests such versions.
+) -> list[PlayTask]:
+    """Return the training tasks, also on other versions of the layouts if `play` requests such versions.
 
     Args:
         teammates: the training teammates.
@@ -194,11 +193,11 @@ def _task_groups(
     total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
     rearranged = {layout: REARRANGED_SHARE * shares[layout.name] for layout in heuristics if play.rearranged}
     fixed = round(tasks * total / (total + sum(rearranged.values())))
-    groups = make_groups(everywhere, fixed, shares, hidden)
+    found = make_play_tasks(everywhere, fixed, shares, hidden)
     for layout, share in rearranged.items():
         count = round((tasks - fixed) * share / sum(rearranged.values()))
-        groups += _rearranged_groups(layout, heuristics[layout], count, play.rearranged, layout.name in hidden)
-    return groups
+        found += _rearranged_tasks(layout, heuristics[layout], count, play.rearranged, layout.name in hidden)
+    return found
 
 
 def _fixes_dish(layout: Layout) -> bool:
@@ -234,10 +233,10 @@ def _heuristic_teammates(teammates: _Teammates) -> dict[Layout, dict[str, dict[s
     return found
 
 
-def _rearranged_groups(
+def _rearranged_tasks(
     layout: Layout, kinds: Mapping[str, dict[str, Policy]], tasks: int, versions: int, hidden: bool
-) -> Iterator[list[PlayTask]]:
-    """Yield one group of tasks for each kind of teammate, on rearranged versions of a layout.
+) -> Iterator[PlayTask]:
+    """Yield the tasks on rearranged versions of a layout, by kind of teammate.
 
     The versions are divided equally among the kinds of teammates, and the tasks of a kind equally among its versions.
     """
@@ -250,7 +249,7 @@ def _rearranged_groups(
         count = max(len(own), round(tasks * len(own) / versions))
         # The numbers of tasks of two versions differ by at most one.
         where = [own[task % len(own)] for task in range(count)]
-        yield make_group(where, kind, mates, hidden, f"{layout.name} rearranged")
+        yield from make_group(where, kind, mates, hidden, f"{layout.name} rearranged")
 
 
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:

@@ -115,13 +115,13 @@ class PlayTask(NamedTuple):
         return f"{self.label} {self.family}"
 
 
-def make_groups(
+def make_play_tasks(
     teammates: Mapping[tuple[Layout, str], Mapping[str, Policy]],
     tasks: int,
     shares: Mapping[str, float],
     hidden: Collection[str] = (),
-) -> list[list[PlayTask]]:
-    """Return groups of tasks.
+) -> list[PlayTask]:
+    """Return tasks, in groups of one layout and one kind of teammate.
 
     Layouts get tasks in proportion to their shares; all kinds of teammates on a layout get equally many tasks.
 
@@ -133,11 +133,11 @@ def make_groups(
     """
     families = Counter(layout.name for layout, _ in teammates)
     total = sum(shares[name] for name in families)
-    groups = []
+    found = []
     for (layout, family), policies in teammates.items():
         count = max(1, round(tasks * shares[layout.name] / total / families[layout.name]))
-        groups.append(make_group([layout] * count, family, policies, layout.name in hidden, layout.name))
-    return groups
+        found += make_group([layout] * count, family, policies, layout.name in hidden, layout.name)
+    return found
 
 
 def make_group(

@@ -24,7 +24,7 @@ from icrl4aht_baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
     PlayTask,
     PlayTrainer,
-    make_groups,
+    make_play_tasks,
     make_players,
     seen_steps,
 )
@@ -60,7 +60,7 @@ def teammates(count: int) -> dict[str, Policy]:
 
 @pytest.fixture(scope="module")
 def trainer() -> PlayTrainer:
-    (tasks,) = make_groups({(LAYOUT, "assembly_line"): teammates(2)}, 8, {LAYOUT.name: 1.0})
+    tasks = make_play_tasks({(LAYOUT, "assembly_line"): teammates(2)}, 8, {LAYOUT.name: 1.0})
     made = PlayTrainer(METHOD, OPTIONS, PLAY, [task._replace(searched=True) for task in tasks], mirror=True)
     made.init = jax.jit(made._initial_state)  # compiled once for several tests
     return made
@@ -204,16 +204,16 @@ class TestTaskGroups:
     def test_tasks_of_a_layout_follow_its_share_and_are_split_evenly_over_families(self):
         wide = get_layout("demo_wide")
         mates = {(LAYOUT, "a"): teammates(1), (LAYOUT, "b"): teammates(1), (wide, "a"): teammates(3)}
-        groups = make_groups(mates, 40, {LAYOUT.name: 1.0, wide.name: 0.25}, hidden=[wide.name])
-        assert [(group[0].name, len(group), group[0].hidden) for group in groups] == [
-            ("cramped_up a", 16, False),
-            ("cramped_up b", 16, False),
-            ("demo_wide a", 8, True),
-        ]
+        tasks = make_play_tasks(mates, 40, {LAYOUT.name: 1.0, wide.name: 0.25}, hidden=[wide.name])
+        assert collections.Counter((task.name, task.hidden) for task in tasks) == {
+            ("cramped_up a", False): 16,
+            ("cramped_up b", False): 16,
+            ("demo_wide a", True): 8,
+        }
 
     def test_teammates_are_used_about_equally_often_and_show_several_behaviours(self):
-        (eight,), (four,), (group,) = (
-            make_groups({(LAYOUT, "a"): teammates(mates)}, tasks, {LAYOUT.name: 1.0})
+        eight, four, group = (
+            make_play_tasks({(LAYOUT, "a"): teammates(mates)}, tasks, {LAYOUT.name: 1.0})
             for mates, tasks in ((3, 8), (10, 4), (3, 60))
         )
         assert sorted(collections.Counter(task.id for task in eight).values()) == [2, 3, 3]
@@ -225,7 +225,7 @@ class TestTaskGroups:
         assert all(len(behaviours) >= 3 for behaviours in found.values())
 
     def test_fewer_tasks_than_minibatches_raise_error(self):
-        (tasks,) = make_groups({(LAYOUT, "a"): teammates(1)}, 3, {LAYOUT.name: 1.0})
+        tasks = make_play_tasks({(LAYOUT, "a"): teammates(1)}, 3, {LAYOUT.name: 1.0})
         with pytest.raises(OptionError, match=r"minibatches = 4: expected at most the 3 tasks .* --minibatches"):
             PlayTrainer(METHOD, OPTIONS, PlayOptions(minibatches=4), tasks)
 
