@@ -167,7 +167,7 @@ class ProofJob(TrainingJob):
 
 
 def _training_seconds(timing: Path) -> float:
-    """Return the seconds that all steps of a training run took, from the timing log; steps before a resume count."""
+    """Return the duration of a training run in seconds, from its timing log, including steps before interruptions."""
     lines = [parse_json(line) for line in read_text(timing).splitlines()]
     steps = np.diff([0, *(line["step"] for line in lines)])
     return float(np.sum(steps / [line["steps_per_second"] for line in lines]))

@@ -124,10 +124,22 @@ _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "rewar
 _STEPS: dict[str, Any] = {"steps": 4000, "batch_size": 16, "context": 200, "learning_rate": 2e-3}
 # With K + 1 queries, each prefix of a context of K transitions has its own query.
 _QUERIES: dict[str, Any] = {"labels": "expert", "queries": _STEPS["context"] + 1}
+_ADAPTING: dict[str, Any] = {"steps": 480, "batch_size": 300, "log_every": 5, "save_every": 20}
 
 RECIPES = {
     "rl2-reference": Recipe(
         "rl2", True, RL2_SETTINGS["model"], {**RL2_SETTINGS["train"], "steps": 1600}, role="plays best"
+    ),
+    "rl2-adapting": Recipe(
+        "rl2",
+        True,
+        RL2_SETTINGS["model"],
+        {**RL2_SETTINGS["train"], **_ADAPTING},
+        play={"episodes": 5, "task_end": 0.5, "imitation": 50.0, "imitation_end": 1.5, "minibatches": 84},
+        profile="varied",
+        start="rl2-reference",
+        one_model=True,
+        role="adapts best",
     ),
     "ad-reference": Recipe(
         "ad", False, _TINY, _STEPS, {"labels": "expert"}, own_round=True, greedy=True, role="best of AD"

@@ -370,7 +370,10 @@ class Scene:
         return jnp.where(jnp.any(allowed), jnp.asarray(SEARCH_ORDER)[best], otherwise)
 
     def wander(self, stay_score: int = 50) -> Int[Array, ""]:
-        """Return a step to a free neighbour cell, else `stay`, or a push of the partner if `stay_score` > 100."""
+        """Return a move to a free neighbour cell.
+
+        If no cell is free, return `stay`, or a move towards an adjacent partner if `stay_score` > 100.
+        """
         target = jnp.asarray(self.tables.moves)[self.own_cell].astype(jnp.int32)
         # As in the published code, pushing costs 100, so a `stay_score` above 100 prefers pushing to staying.
         scores = [

@@ -187,7 +187,9 @@ def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
 
 
 def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first episode and the end (exclusive) of a range in histories of `counts` episodes, int64 (H,) each.
+    """Return the first episode and the end (exclusive) of a range of episodes in every history, two int64 (H,).
+
+    `counts` has the number of episodes of each history.
 
     Raises:
         OptionError: if the range is malformed, or some history has no episode in the range.

@@ -110,7 +110,7 @@ def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> Bat
     return view
 
 
-class NumberedBatches:
+class RenumberedLayoutSampler:
     """Sampler of state records that renumbers the layouts of another sampler's batches, and may mirror rows at random.
 
     Args:
@@ -155,6 +155,6 @@ def number_layouts(sampler: Any, layouts: Sequence[Layout], mirror: bool = False
     """Return a sampler of batches in which the number of a layout is its position in `layouts`."""
     numbers = np.array([layouts.index(layout) for layout in sampler.layouts], np.int32)
     if mirror:
-        return NumberedBatches(sampler, numbers, len(layouts))
+        return RenumberedLayoutSampler(sampler, numbers, len(layouts))
     agree = sampler.dataset.obs != "state" or numbers.tolist() == list(range(len(layouts)))
-    return sampler if agree else NumberedBatches(sampler, numbers)
+    return sampler if agree else RenumberedLayoutSampler(sampler, numbers)

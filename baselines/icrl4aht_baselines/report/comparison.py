@@ -364,9 +364,9 @@ def describe_training_runs() -> str:
     better = sum(not one.agent.startswith("best response") for one in behaviours)
     runs = _format_range([len(one.seeds) for one in behaviours], "d")
     return (
-        f"Each of {len(behaviours)} behaviours has a best response from {runs} training "
-        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. For {better} behaviours a stored "
-        f"model earns more, so B is the return of that model."
+        f"For each of {len(behaviours)} behaviours (different teammates) a best response was trained in {runs} "
+        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. For {better} of them a stored model "
+        f"earns more, and its return counts as that of the best response."
     )
 
 

@@ -79,7 +79,7 @@ def _trackio(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
         from trackio.utils import TRACKIO_DIR as used
     if used != Path(wanted):
         raise OptionError(
-            f"trackio writes into {used} as long as this process runs, expected {wanted}: train in another "
+            f"trackio reads TRACKIO_DIR only once and still writes into {used}, expected {wanted}: train in another "
             "process, or set TRACKIO_DIR to one folder for all runs"
         )
     offline = constants.HF_HUB_OFFLINE or not {"TRACKIO_SPACE_ID", "TRACKIO_SERVER_URL"} & os.environ.keys()

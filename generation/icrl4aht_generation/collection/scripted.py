@@ -45,7 +45,7 @@ _LINE_BYTES = 100  # maximum size of a line in the files of metrics or timing
 
 
 def _array_shapes(layout: Layout, config: NoiseConfig) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Return the shape and dtype of every array in a scripted artefact, by name."""
+    """Return array name -> shape and dtype, for the arrays in a task folder with histories that a script plays."""
     actions, chances = SCRIPT_ARRAYS
     return array_shapes(layout, config.histories, config.episodes) | {
         actions: ((config.histories, config.episodes * KEPT_STEPS), "int8"),
@@ -54,7 +54,7 @@ def _array_shapes(layout: Layout, config: NoiseConfig) -> dict[str, tuple[tuple[
 
 
 def scripted_bytes(layout: Layout, config: NoiseConfig) -> int:
-    """Return the size of a scripted artefact in bytes."""
+    """Return the maximum size in bytes of a task folder with histories that a script plays."""
     return arrays_bytes(_array_shapes(layout, config)) + (config.histories + config.episodes) * _LINE_BYTES
 
 

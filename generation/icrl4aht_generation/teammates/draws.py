@@ -223,7 +223,7 @@ def equal_parameters(theta: Mapping[str, float], other: Mapping[str, float]) -> 
 
 
 def usable_families(layout: str, base_seed: int = 0) -> list[str]:
-    """Return the families that have usable drawn teammates for a training layout, in the paper's order."""
+    """Return the families with sampled teammates that tasks on a training layout may use, in the paper's order."""
     return [family for family in HEURISTIC_FAMILIES if _usable(get_layout(layout).name, family, base_seed)]
 
 

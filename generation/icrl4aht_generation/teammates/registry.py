@@ -54,8 +54,8 @@ def heuristic_teammate(family: str, preset: str, theta_id: int) -> dict[str, Any
 def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) -> dict[str, Any]:
     """Return a teammate entry with random parameters, seeded by the string `family:theta_id:split:base_seed`.
 
-    Published tasks are not sampled by this function: their manifests contain every parameter (paper, App. B.2, train
-    and test ranges).
+    The ranges of the splits "train" and "test" are the paper's (App. B.2). Teammates of the published manifests are not
+    sampled, because the manifests contain every parameter.
 
     Args:
         family: name of a heuristic.
@@ -73,7 +73,7 @@ def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) 
     return heuristic_entry(family, theta_id, base_seed, dict(theta))
 
 
-@cache  # profiles and tables sample the same teammates many times
+@cache  # profiles and lists of drawn teammates ask for the same parameters many times
 def _sampled_theta(heuristic: Heuristic, split: str, seed: str) -> dict[str, float]:
     samplings = {"train": heuristic.train, "test": heuristic.test}
     samplings |= {"diverse": heuristic.diverse} if heuristic.diverse else {}

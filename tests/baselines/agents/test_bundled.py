@@ -104,7 +104,7 @@ def test_bundling_rejects_invalid_names_unfinished_runs_and_large_models(trained
 
 
 def test_models_in_the_package_are_small_and_loadable_and_have_cards():
-    assert set(bundled_models(MODELS)) == {"ad-reference", "ad-rising", "dpt-reference", "rl2-reference"}
+    assert set(bundled_models(MODELS)) == {"ad-reference", "dpt-reference", "rl2-adapting", "rl2-reference"}
     scores = describe_scores(read_stored(results_file()), bundled_models(MODELS))
     for model in bundled_models(MODELS).values():
         assert model.role and re.fullmatch(r"M [+-]\d.*", scores[model.name].split(", ")[-1])

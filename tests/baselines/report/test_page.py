@@ -146,7 +146,7 @@ def test_curves_share_axes_and_can_have_one_episode():
 
 def test_model_cards_describe_the_training_data():
     """The card of each bundled model contains the sentences that `training_sentence` writes for its training runs."""
-    for name in ("ad-reference", "ad-rising", "dpt-reference", "rl2-reference"):
+    for name in ("ad-reference", "dpt-reference", "rl2-adapting", "rl2-reference"):
         configs = [json.loads(path.read_text()) for path in (MODELS / name).glob("*/config.json")]
         card = (MODELS / name / "README.md").read_text(encoding="utf-8")
         assert all(training_sentence(config) in card for config in configs)

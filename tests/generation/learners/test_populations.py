@@ -118,9 +118,9 @@ def test_critics_receive_the_partner_if_partners_vary():
 
 
 def paper_slot_weights(algorithm: Any, memory: Any) -> np.ndarray:
-    """Return each slot's weight in the paper's objective of the policy that plays the slot, float64 (2, N).
+    """Return the weight of each slot's return in the objective that the paper gives the slot's policy, float64 (2, N).
 
-    The mean return over the slots of two policies stands for their expected return in the paper's equations.
+    The expected return of a pair of policies is estimated by the mean over the slots in which the pair plays.
     """
     assignment = algorithm.assignment(16)
     k = getattr(algorithm, "members", 0)

@@ -42,7 +42,7 @@ def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Ar
     blocked = jnp.where(u[0] < 0.7, STAY, _step_to_middle(scene))
     action = jnp.where(mode == BLOCKER, blocked, action)
     action = jnp.where((mode == LAZY) & (u[0] > params["action_probability"]), STAY, action)
-    # Intended waiting also counts as stuck, so agents that wait for each other separate.
+    # Steps of deliberate waiting count too. Two agents that wait for each other therefore start to wander.
     stuck = jnp.where(scene.own_cell == memory.cell, memory.stuck + 1, 0)
     return action, TerritoryMemory(following, scene.own_cell, stuck)
 
