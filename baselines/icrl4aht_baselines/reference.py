@@ -124,7 +124,7 @@ _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "rewar
 _STEPS: dict[str, Any] = {"steps": 4000, "batch_size": 16, "context": 200, "learning_rate": 2e-3}
 # With K + 1 queries, each prefix of a context of K transitions has its own query.
 _QUERIES: dict[str, Any] = {"labels": "expert", "queries": _STEPS["context"] + 1}
-_ADAPTING: dict[str, Any] = {"steps": 480, "batch_size": 300, "log_every": 5, "save_every": 20}
+_ADAPTING: dict[str, Any] = {"steps": 320, "batch_size": 384, "log_every": 5, "save_every": 20}
 
 RECIPES = {
     "rl2-reference": Recipe(
@@ -135,8 +135,8 @@ RECIPES = {
         True,
         RL2_SETTINGS["model"],
         {**RL2_SETTINGS["train"], **_ADAPTING},
-        play={"episodes": 5, "task_end": 0.5, "imitation": 50.0, "imitation_end": 1.5, "minibatches": 84},
-        profile="varied",
+        play={"episodes": 5, "task_end": 0.5, "imitation": 50.0, "imitation_end": 1.5, "minibatches": 64},
+        profile="search",
         start="rl2-reference",
         one_model=True,
         role="adapts best",
@@ -175,6 +175,7 @@ class ReferenceJob(TrainingJob):
         out: folder of all jobs, with the content that the top of this module describes.
         teacher: name or run folder of the agent that plays and labels the histories, such as `rl2-reference`; if None,
             RL^2 is trained first.
+        xla_threads: see `Job`.
     """
 
     model: str
@@ -182,6 +183,7 @@ class ReferenceJob(TrainingJob):
     seed: int
     out: Path
     teacher: str | None = None
+    xla_threads: int | None = None
 
     @property
     def name(self) -> str:
@@ -277,7 +279,7 @@ class ReferenceJob(TrainingJob):
         """Return the teacher; without a given teacher, train RL^2 first."""
         if self.teacher:
             return self.teacher
-        job = ReferenceJob("rl2-reference", self.track, 0, self.out)
+        job = ReferenceJob("rl2-reference", self.track, 0, self.out, xla_threads=self.xla_threads)
         job.run(wait=True)
         return job.run_folder
 

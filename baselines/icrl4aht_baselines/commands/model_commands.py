@@ -188,8 +188,9 @@ def reference_command(
         find_agent(teacher)
         for name in names:
             check_learns_from_teacher(name)
+    threads = 1 if options.workers or options.executor == "ray" else None  # a single job may use all cores
     jobs = [
-        ReferenceJob(name, of_track, seed, out, teacher)
+        ReferenceJob(name, of_track, seed, out, teacher, threads)
         for seed in range(seeds)
         for name in dict.fromkeys(names)
         for of_track in RECIPES[name].tracks
@@ -198,8 +199,9 @@ def reference_command(
     if not jobs:
         raise click.UsageError(f"--track {track[0]}: {' and '.join(names)} have no model for it; leave out --track")
     taught = {job.track: None for job in jobs if not (job.recipe.plays or teacher)}
-    teachers = [ReferenceJob("rl2-reference", of_track, 0, out) for of_track in taught]
-    limit_xla_threads(1)  # equal to the workers' limit, so that workers can resume these jobs
+    teachers = [ReferenceJob("rl2-reference", of_track, 0, out, xla_threads=threads) for of_track in taught]
+    if threads:  # equal to the workers' limit, so that workers can resume these jobs
+        limit_xla_threads(threads)
     run_jobs([*dict.fromkeys([*teachers, *jobs])], out, Console(soft_wrap=True), options)
     if evaluates:
         with progress_bars() as show:
