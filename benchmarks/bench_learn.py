@@ -200,7 +200,7 @@ def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -
 
 
 def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int) -> None:
-    """Print steps/s of cached acting on some tasks of a layout, and the ratio to exact acting."""
+    """Print the steps/s of a model with `cached` acting on up to `most` tasks, and their ratio to `exact` acting."""
     tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
     dropped = dropped_steps(SIZES[size].train["context"])  # number of steps after which the window is computed again
     lengths: dict[Acting, int] = {"cached": dropped * -(-10 * steps // dropped), "exact": steps}

@@ -132,7 +132,7 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> Path:
     own, cleared = evaluate_into(agent, agent.name), evaluate_into(agent, "cleared", control="cleared")
     runs = [own, cleared, *(evaluate_into(find_agent(name), name) for name in _AGENTS)]
     for run in runs:
-        click.echo(f"{run.agent}, mean return by episode {blocks_text([*run.returns.values()])}")
+        click.echo(f"{run.agent}, mean return in episodes {blocks_text([*run.returns.values()])}")
 
     print_stage(6, "drawing")
     draw_adaptation(runs, picture)

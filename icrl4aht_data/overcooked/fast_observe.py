@@ -64,7 +64,7 @@ def fast_observe(
 
 
 class _Renderer:
-    """Lookup tables and rendering for one layout, one dtype, and own or canonical channels."""
+    """Function from state records to observations by lookup tables, for one layout, dtype and kind of channels."""
 
     def __init__(self, layout: Layout, dtype: str, canonical: bool) -> None:
         self._layout, self._dtype, self._canonical = layout, np.dtype(dtype), canonical

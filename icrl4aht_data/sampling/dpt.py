@@ -152,7 +152,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         else:
             # Single rows after a history's end cannot be read: the history's last row is read, and replaced below.
             rows, next_rows = steps, np.minimum(steps + 1, self._draws.lengths[context][:, None] - 1)
-        # Requests need the axis Q, which arrays with one query do not have.
+        # A `ReadRequest` needs an axis for queries, which the batch's arrays do not have for one query per context.
         queries, record = query_steps.shape, records.shape[2:]
         reads = [
             ReadRequest(f"{self.labels}_actions", query, query_steps, batch.query_target.reshape(queries)),

@@ -87,7 +87,7 @@ def test_demo_prints_every_step_and_writes_all_files(release, tmp_path, monkeypa
     for expected in ("1/6", "target_actions", "transitions replayed", "6/6", "done in", str(page)):
         assert expected in said, expected
     assert "Its return rises by what it remembers: +21.5" in said
-    assert "search, mean return by episode 1: -20.0, 2-5: 41.5, 6-20: 41.5\n" in said
+    assert "search, mean return in episodes 1: -20.0, 2-5: 41.5, 6-20: 41.5\n" in said
     assert (tmp_path / "adaptation.png").read_bytes()[1:4] == b"PNG"
     assert "validation tasks</h3>" in page.read_text()
     config = json.loads((tmp_path / "run" / "config.json").read_text())
@@ -104,7 +104,7 @@ def test_complete_demo_on_the_bundled_release_shows_plausible_returns(tmp_path, 
     settings = replace(SETTINGS, tasks=None, training=short, seeds=range(1))
     demo.run_demo(tmp_path, settings)
     rows = re.findall(
-        r"(\w+), mean return by episode 1: ([-.\d]+), 2-5: [-.\d]+, 6-20: ([-.\d]+)", capsys.readouterr().out
+        r"(\w+), mean return in episodes 1: ([-.\d]+), 2-5: [-.\d]+, 6-20: ([-.\d]+)", capsys.readouterr().out
     )
     found = {agent: (float(first), float(last)) for agent, first, last in rows}
     assert found["stay"][0] < 20 < found["oracle"][0]

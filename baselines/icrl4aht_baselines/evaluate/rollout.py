@@ -103,9 +103,11 @@ class EvaluationRollout:
         return state._replace(ego=self._initial_memories(state.env.key), before=no_outcome(state.env.key.shape[0]))
 
     def move_to_layouts(self, state: RolloutState) -> RolloutState:
-        """Return another rollout's state between two episodes, moved to the layouts of this rollout.
+        """Return the state of another rollout of the same tasks, so that the next episode is on this rollout's layouts.
 
-        Both rollouts play the same tasks. Random keys, the number of the episode and the egos' memories are kept.
+        Args:
+            state: state of the other rollout, between two episodes. Its random keys, episode number and the egos'
+                memories are kept.
         """
         numbers = self._layout_numbers()
         record = self.env.first_record(state.env.key, state.env.episode, numbers)

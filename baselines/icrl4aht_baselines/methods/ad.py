@@ -177,5 +177,5 @@ def action_method(name: str, label: str, options: ModelOptions, world: World, tr
 
 
 def ad(options: ModelOptions, world: World) -> Method:
-    """Return the method AD; its model has 3,283,870 parameters for C = 40 channels."""
+    """Return the method AD; with default options and C = 40 channels its model has 3,283,870 parameters."""
     return action_method("ad", "AD", options, world, make_transformer(options))

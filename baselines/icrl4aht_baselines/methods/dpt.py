@@ -143,7 +143,7 @@ def _repeat_in_turn(values: Shaped[Array, "B Q ..."], length: int) -> Shaped[Arr
 
 
 def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True) -> Method:
-    """Return the method DPT; its model has 3,285,022 parameters for C = 40 channels."""
+    """Return the method DPT; with default options and C = 40 channels its model has 3,285,022 parameters."""
     tokens = make_tokens(TransitionTokens, options, world)
     head, next_obs = nn.Dense(world.actions), make_next_obs_head(options, world)
     model = DPT(tokens, make_transformer(options), head, world.obs_shape, next_obs, finished_episodes_only)

@@ -62,6 +62,6 @@ class RecurrentTrunk(nn.Module):
 
 
 def hybrid_ad(options: ModelOptions, world: World) -> Method:
-    """Return the method Hybrid-AD; its model has 913,310 parameters for C = 40 channels."""
+    """Return the method Hybrid-AD; with default options and C = 40 channels its model has 913,310 parameters."""
     trunk = RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
     return action_method("hybrid_ad", "Hybrid-AD", options, world, trunk)

@@ -212,7 +212,7 @@ class EvaluationRun:
         agent: name of the agent.
         protocol: name of the protocol.
         table: results as a table; its columns are described at the top of this module.
-        cells: result cell -> mean returns over the seeds, float64 (instances, episodes), in the paper's order.
+        cells: `ResultCell` -> returns averaged over seeds, float64 (tasks, episodes); layouts are in the paper's order.
         note: text that distinguishes several results of one agent in the same result cells; usually empty.
         sources: origins of the results; each result cell has one origin.
     """

@@ -360,9 +360,9 @@ class Headline(NamedTuple):
         """The summary as text for the console and Markdown."""
         parts = [self.score.text] if self.score else []
         parts.append(f"return {self.mean.text()}")
-        parts += [f"by episode {self.blocks}"] if self.blocks else []
+        parts += [f"in episodes {self.blocks}"] if self.blocks else []
         text = f"{self.label} ({self.protocol}), {self.tasks}: {'; '.join(parts)}."
-        text += " Parentheses: 95 % intervals." if self.mean.range() else ""
+        text += " Ranges in parentheses: 95 % intervals." if self.mean.range() else ""
         return f"{text} {self.why_no_score}".rstrip()
 
 

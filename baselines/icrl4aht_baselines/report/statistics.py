@@ -49,11 +49,11 @@ class MeanInterval(NamedTuple):
 
 
 class Stratum(NamedTuple):
-    """Group of units, within which the bootstrap resamples.
+    """Group within which the bootstrap for the ratio sum(gains) / sum(scales) resamples units, such as teammates.
 
     Attributes:
-        gains: numerators of the units in each training run, (T, U).
-        scales: denominators of the units, (U,).
+        gains: each unit's part of the numerator in each training run, (T, U).
+        scales: each unit's part of the denominator, (U,).
     """
 
     gains: Float[np.ndarray, "T U"]

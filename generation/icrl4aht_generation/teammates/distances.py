@@ -106,11 +106,11 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
 
 @lru_cache(maxsize=2)
 def common_states(layout: Layout, episodes: int = _EPISODES) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
-    """Return the states on which a layout's teammates are compared, and the actions of the test instances.
+    """Return the states on which a layout's teammates are compared, and the test teammates' actions in these states.
 
     Args:
         layout: layout of the states.
-        episodes: number of episodes of each test instance with each of the two egos.
+        episodes: number of episodes of each test instance with each of the egos `random` and `oracle`.
 
     Returns:
         State records, see `common_records`, and the actions of the test instances, int8 (instances, T, N).
@@ -137,7 +137,7 @@ def common_records(layout: Layout, episodes: int = _EPISODES) -> UInt8[Array, "T
 
     Args:
         layout: layout of the episodes.
-        episodes: number of episodes of each instance with each of the two egos.
+        episodes: number of episodes of each instance with each of the egos `random` and `oracle`.
 
     Raises:
         UnknownNameError: if the benchmark does not have the layout.

@@ -130,7 +130,7 @@ class SpreadTeammate(Struct, forbid_unknown_fields=True):
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Entry of the teammate in a task."""
+        """The field `teammate` of a task with this teammate, see `heuristic_entry`."""
         return heuristic_entry(self.family, self.theta_id, SPREAD_SEED, dict(self.theta))
 
 

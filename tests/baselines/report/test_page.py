@@ -213,7 +213,7 @@ def test_evaluate_and_report_commands_write_results_tables_and_page(tmp_path, mo
     played = ["evaluate", "--agent", "stay", *options, "--out", tmp_path / "run"]
     printed = run_cli(*played)
     summary = (
-        "stay (published), 1 training cell: return 0.0; by episode 1: 0.0, 2-5: 0.0. No score: no best response "
+        "stay (published), 1 training cell: return 0.0; in episodes 1: 0.0, 2-5: 0.0. No score: no best response "
         "measured."
     )
     assert summary in printed and f"2 results in {tmp_path / 'run'}, 1 program compiled" in printed

@@ -120,8 +120,8 @@ def test_summary_of_a_run_has_score_and_return_by_episode(invented_responses):
     assert found.score and found.score.total[:3] == pytest.approx((11.0 / SPAN,) * 3), "equal instances"
     assert found.text == (
         "mine (seeded), 4 test cells with headroom, of 8 played: score 0.55 (0.55 to 0.55), interquartile mean 0.55, "
-        "worst teammate 0.55 (demo_wide H1), regret 9.0; return 11.0 (11.0 to 11.0); by episode 1: 10.0, 2-5: 10.0, "
-        "6-20: 10.0, 21-100: 12.0. Parentheses: 95 % intervals."
+        "worst teammate 0.55 (demo_wide H1), regret 9.0; return 11.0 (11.0 to 11.0); in episodes 1: 10.0, 2-5: 10.0, "
+        "6-20: 10.0, 21-100: 12.0. Ranges in parentheses: 95 % intervals."
     )
 
 

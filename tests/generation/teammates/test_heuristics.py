@@ -297,7 +297,7 @@ CRAMPED_CASES = [
     # Two H1 agents fetch different ingredients of a mixed recipe.
     (H1, {}, {"recipe": MIXED}, "1 22- 12- right, 0 22- 32- left"),
     (H1, {}, {"recipe": MIXED, "pot_items": [ZERO + ONE]}, "1 22- 32- left"),
-    # H2 waits for a partner at the only access cell of its target, and walks around the partner.
+    # Depending on `yield_bias`, H2 waits for a partner near the only cell beside its target, or sidesteps it.
     (H2, {"yield_bias": 0.1}, {}, "1 21- 12- stay, 1 21- 32- left"),
     (H2, {"yield_bias": 0.05}, {}, "1 21- 12- left, 1 32- 22- up"),
     (H2, {"yield_bias": 0.3}, {}, "0 32- 22- up"),

@@ -25,7 +25,7 @@ class FCP(Algorithm):
     members: int
 
     def assignment(self, environments: int) -> Assignment:
-        """Return the assignment, in which each member has one objective: its self-play return."""
+        """Return an assignment in which each member plays both agents of its environments, for its self-play return."""
         member = np.repeat(np.arange(self.members), environments)
         # A member plays both agents and learns from both, because both earn its self-play return.
         both = np.stack([member, member])

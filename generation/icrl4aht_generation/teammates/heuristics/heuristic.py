@@ -152,7 +152,7 @@ def next_key(key: Key[Array, ""]) -> Key[Array, ""]:
 
 def draw(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, " 4"]]:
     """Return a teammate's next random key, and four uniform random numbers u1..u4, float32 in [0, 1)."""
-    # As in the published code, the first of the five keys is the next key.
+    # As in the published code, the first of five keys becomes the next random key; the others give u1..u4.
     keys = jax.random.split(key, 5)
     return keys[0], jax.vmap(jax.random.uniform)(keys[1:])
 
