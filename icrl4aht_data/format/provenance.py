@@ -39,7 +39,7 @@ class StreamReturns(Struct, frozen=True, omit_defaults=True):
 
 
 class StreamFilter(Struct, frozen=True, omit_defaults=True):
-    """Mean returns before and after filtering a task's streams.
+    """Mean returns of all recorded histories of a task (its streams), and of those in the release.
 
     Args:
         before: returns of all recorded streams.

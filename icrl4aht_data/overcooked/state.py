@@ -1,4 +1,4 @@
-"""State records: the game's state as S bytes (uint8), an input of rules and observations; 14 to 36 bytes by layout.
+"""State records: the game's state as S bytes (uint8). S is 14 to 36, depending on the layout.
 
 Columns of a record, in order (columns of the agents: first the ego, then the teammate):
 

@@ -319,7 +319,7 @@ class _PublishedHistory:
             )
 
     def read(self, name: str) -> np.ndarray:
-        """Return one array in the field's compact dtype: (T, ...), or (E, S) for `episode_end_state`.
+        """Return one array with the dtype of `Field.compact` and the shape (T, ...), or (E, S) for `episode_end_state`.
 
         Raises:
             PublishedFormatError: if the array is invalid; the message has its name, and what was expected and found.

@@ -110,7 +110,7 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
 
 
 def _refusal_reason(folder: Path) -> str | None:
-    """Return why a folder may not be replaced, such as "is not a folder"; None if this package wrote the folder."""
+    """Return why a path may not be replaced, such as "is not a folder"; None for a folder that this package made."""
     if not folder.is_dir():
         return "is not a folder"
     present = set(files_below(folder))

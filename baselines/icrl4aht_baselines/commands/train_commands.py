@@ -88,7 +88,7 @@ def evaluate_command(
     from icrl4aht_baselines.evaluate.protocols import CONTROLS, get_protocol, hidden_recipe_note, limit_tasks
     from icrl4aht_baselines.evaluate.rollout import ProgramCache
     from icrl4aht_baselines.report.page import summary_lines
-    from icrl4aht_baselines.report.results import evaluate_agent, note_results
+    from icrl4aht_baselines.report.results import evaluate_agent, write_run_and_tasks
     from icrl4aht_baselines.report.scores import control_lines
 
     if forget and controls:
@@ -107,7 +107,7 @@ def evaluate_command(
         played = evaluate_controls(ego.name, ego.make, chosen, rules, details=ego.details, **options)
         lines = control_lines(played, chosen)
         for control in CONTROLS:
-            note_results(out / control, ego.run, chosen)
+            write_run_and_tasks(out / control, ego.run, chosen)
     # With --controls, the results are in `out` already, so this call only reads them.
     run = evaluate_agent(ego, chosen, rules, control="cleared" if forget else None, **options)
     for line in [*summary_lines([run]), *lines]:

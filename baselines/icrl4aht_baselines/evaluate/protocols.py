@@ -129,7 +129,7 @@ def get_protocol(name: str, episodes: int | None = None) -> Protocol:
 def hidden_recipe_note(tasks: Sequence[Task]) -> str:
     """Return a sentence that names layouts on which observations do not show the ordered dish, or an empty string.
 
-    A layout with a single recipe is named only if a task on the layout fixes the dish.
+    A layout with a single recipe is left out, since its dish is known, unless a task replaces the layout's recipes.
     """
     hidden = [task for task in tasks if not task.layout.shows_recipe]
     hidden = [task for task in hidden if len(task.layout.recipes) > 1 or task.recipes is not None]

@@ -168,7 +168,7 @@ class ResultSource(NamedTuple):
     Attributes:
         folder: folder that the results were read from.
         settings: settings of the evaluation, see `evaluate.results.Result`.
-        trained: content of run.json, see `note_results`; None for an agent without a run folder.
+        trained: content of run.json, see `write_run_and_tasks`; None for an agent without a run folder.
         tasks: result cell -> evaluated tasks, in the order of the returns.
         seen: layouts and teammates in the agent's training; None if they are not known.
     """
@@ -259,7 +259,7 @@ def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] = ()) -> None:
+def write_run_and_tasks(results: Path, run: Path | None = None, tasks: Sequence[Task] = ()) -> None:
     """Store the model's settings and the evaluated tasks in a folder of results, for reports.
 
     Args:
@@ -312,7 +312,7 @@ def evaluate_agent(
     played = show and bar_updater(show, what, len(tasks) * len(seeds) * protocol.episodes)
     shared: Any = {"seeds": seeds, "out": out, "details": agent.details, "played": played}
     evaluate(agent.name, agent.make, tasks, protocol, **shared, **options)
-    note_results(out, agent.run, tasks)
+    write_run_and_tasks(out, agent.run, tasks)
     return read_run(out)
 
 
@@ -348,7 +348,7 @@ def as_run(
         results: results of `icrl4aht_baselines.evaluate.evaluate`, all under the same settings.
         where: folder of the results, for messages.
         tasks: evaluated tasks that are neither published test tasks nor the package's validation tasks.
-        trained: content of run.json, see `note_results`; None for an agent without a run folder.
+        trained: content of run.json, see `write_run_and_tasks`; None for an agent without a run folder.
 
     Raises:
         OptionError: if the settings differ, or a task is neither in the package nor in `tasks`.

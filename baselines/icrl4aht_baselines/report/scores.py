@@ -214,7 +214,11 @@ def is_scored(returns: CellReturns | None, scale: CellScale | None) -> bool:
 
 
 def _gains_and_scales(returns: CellReturns, scale: CellScale) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Return R - S (T, U, S), B - S (U,) and the teammates' behaviours, of the tasks with best responses."""
+    """Return the gains of a cell's tasks that have a best response, their scales, and their teammates' behaviours.
+
+    A gain is the agent's return minus that of `stay`, for each training run, task and seed; a task's scale is the best
+    response's return minus that of `stay`.
+    """
     known = [number for number, task in enumerate(returns.tasks) if task in scale.tasks]
     of_task = [scale.tasks[returns.tasks[number]] for number in known]
     stays, bests = (np.array([getattr(one, name) for one in of_task]) for name in ("stay", "best"))

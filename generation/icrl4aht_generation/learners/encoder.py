@@ -1,9 +1,10 @@
 """Encoder of observations for learners and sequence models: convolutions, or a dense layer on flat observations.
 
-Inputs are observations, or a compact form that is computed from state records. Both forms have equal parameters, and
-equal results up to the order of summation. `WindowWords` are for the convolutions: a 1 x 1 convolution sees one cell,
-so it is computed once per word, which is a possible content of a cell. `WindowEntries` are for the dense layer: most
-entries of an agent's flat window are always 0, because the agent stays in its room. B denotes the batch dimensions.
+Inputs are observations, or a compact form that is computed from state records. An encoder has the same parameters for
+both inputs, and equal results up to the order of summation. `WindowWords` are for the convolutions: a 1 x 1 convolution
+sees one cell, so it is computed once per word, which is a possible content of a cell. `WindowEntries` are for the dense
+layer: most entries of an agent's flat window are always 0, because the agent stays in its room. B denotes the batch
+dimensions.
 
 Convolutions are matrix products: a 3 x 3 SAME convolution of a 5 x 5 patch is one dense matrix built from its kernel.
 """

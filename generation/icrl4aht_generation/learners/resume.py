@@ -346,8 +346,8 @@ def _named_leaves(tree: Any, part: str = "") -> dict[str, Any]:
 
 def _file_bytes(arrays: dict[str, np.ndarray], metadata: dict[str, str]) -> bytes:
     """Return arrays and metadata as the bytes of a safetensors file; equal content gives equal bytes."""
-    # The library writes metadata in a random order, so metadata is added below to a file without metadata.
-    # `save_file` is not used, because it does not raise an OSError for a full disk.
+    # safetensors writes metadata in a random order. Therefore `to_bytes` gets the arrays only, and the metadata is
+    # inserted into the header below. `save_file` is not used, because it does not raise an OSError for a full disk.
     content = to_bytes(arrays)
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.dumps({"__metadata__": metadata} | json.loads(content[8:end]), separators=(",", ":")).encode()

@@ -87,9 +87,10 @@ DRAW_NUMBERS = [
 
 
 def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest]:
-    """Return the nearest test instance of each policy that plays the teammate on a layout.
+    """Return the test teammate of a layout that acts most like each of the given teammates.
 
-    Policies with equal functions share one compilation. Behaviours are numbered in the order of the policies.
+    Each result also has the share of states in which the two act differently, and the number of the given teammate's
+    behaviour, counted in the order of the policies. Policies with equal functions are compiled once.
 
     Raises:
         UnknownNameError: if the benchmark does not have the layout.

@@ -96,10 +96,10 @@ class Draw(Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def admissible(self) -> bool:
         """Whether the draw behaves differently from all test instances of its family (of all families if diverse)."""
-        return self.nearest_compared[0] >= _least_distance(self.base_seed)
+        return self.nearest_test_instance[0] >= _least_distance(self.base_seed)
 
     @property
-    def nearest_compared(self) -> tuple[float, str]:
+    def nearest_test_instance(self) -> tuple[float, str]:
         """Distance and name of the most similar test instance of the family, or of all families for a diverse draw.
 
         The draw is `admissible` if this distance is large enough.
@@ -126,7 +126,7 @@ class Draw(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
-    """Return the draws of a family on a training layout, by theta_id.
+    """Return the sampled teammates (draws) of a heuristic family on a training layout, in the order of theta_id.
 
     Raises:
         UnknownNameError: if the layout, family or seed does not exist, or the layout has no training tasks.
@@ -234,7 +234,7 @@ def _ordered_draws(layout: str, family: str, base_seed: int) -> list[Draw]:
     """
     draws = _usable(layout, family, base_seed)
     if not draws:
-        farthest = max((draw.nearest_compared for draw in read_draws(layout, family, base_seed)), default=None)
+        farthest = max((draw.nearest_test_instance for draw in read_draws(layout, family, base_seed)), default=None)
         near = f", to {farthest[1]}" if farthest else ""
         raise OptionError(
             f"{layout}: no usable {_OF_SEED[base_seed]} teammates of {family}: "
@@ -269,7 +269,7 @@ def unusable_reason(layout: str, family: str, base_seed: int = 0) -> str:
         return "no draws were measured; `icrl4aht-data research draws` measures them"
     admissible = [draw for draw in draws if draw.admissible]
     if not admissible:
-        farthest = max(draw.nearest_compared[0] for draw in draws)
+        farthest = max(draw.nearest_test_instance[0] for draw in draws)
         tests = "a test teammate" if base_seed in _DIVERSE_SEEDS.values() else "a test teammate of the family"
         return f"all {len(draws)} draws act like {tests} (distance {farthest:.3f} at most)"
     widest = max(draw.spread for draw in admissible)

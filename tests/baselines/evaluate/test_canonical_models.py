@@ -18,7 +18,7 @@ from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, RolloutState
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.reference import ReferenceJob, write_bundled_card
-from icrl4aht_baselines.report.results import note_results
+from icrl4aht_baselines.report.results import write_run_and_tasks
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_generation.env import EnvState
@@ -68,7 +68,7 @@ def test_model_is_evaluated_on_a_layout_without_training_data(trained_run, tmp_p
     task = published_task(THIRD.name, "H4/t0")
     results = evaluate(agent.name, agent.make, [task], SHORT, details=agent.details, out=tmp_path)
     assert np.shape(results[0].returns) == (1, 1)
-    note_results(tmp_path, folder)
+    write_run_and_tasks(tmp_path, folder)
     monkeypatch.setattr(ReferenceJob, "results", lambda job, kind: tmp_path)
     (tmp_path / "x-y").mkdir()
     card = write_bundled_card("x-y", [ReferenceJob("x-y", "layout", 0, folder)], tmp_path).read_text(encoding="utf-8")

@@ -117,7 +117,7 @@ def test_metrics_separate_returns_of_self_play_and_cross_play(updated):
 
 
 def test_population_update_equals_separate_updates_of_each_policy(lbrdiv, learn):
-    """Compare with one separate update of each policy on the slots that it plays."""
+    """Compare an update of the population with a separate update of each policy on the slots that it plays."""
     trained, before = lbrdiv.population, lbrdiv.before
     assignment = trained.assignment
     key = jax.random.split(jax.random.fold_in(before.key, before.update), 3)[1]

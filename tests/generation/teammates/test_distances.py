@@ -65,7 +65,7 @@ def return_parameter(params, steps, view, key):
 
 
 def return_parameter_too(params, steps, view, key):
-    """Return the parameter as the action, like `return_parameter`, but in a different function."""
+    """Return the parameter as the action: a copy of `return_parameter`, since equal functions are compiled together."""
     return params, steps + 1
 
 

@@ -46,7 +46,7 @@ def make_provenance(
 
 
 def four_tasks() -> Tasks:
-    """Return PPO and noise tasks with one teammate, a task with a validation teammate, and a task on coord_simple."""
+    """Return a PPO task and a noise task with the same teammate, a validation task, and a task on coord_simple."""
     return [
         (heuristic_task("demo_wide", "H3", 12), make_provenance("ppo"), [(0, 0.0, 20.0), (1, 0.0, 4.0)]),
         (heuristic_task("demo_wide", "H3", 12, seed=1), make_provenance("noise"), [(0, 1.0, 41.0), (0, 0.0, 45.0)]),

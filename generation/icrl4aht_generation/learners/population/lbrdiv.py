@@ -67,7 +67,10 @@ class LBRDiv(Algorithm):
         return jnp.concatenate([pairs.ravel(), pairs.ravel()])
 
     def adapt(self, memory: Multipliers, returns, seen) -> Multipliers:
-        """Return multipliers max(Lambda - eta (J(pi_i, BR_i) - J(other pair) - eps), 0), with the old diagonal."""
+        """Return new multipliers max(multiplier - eta (J(pi_i, BR_i) - J(other pair) - eps), 0).
+
+        The diagonal does not change, nor does a multiplier whose returns are unknown or not new.
+        """
         k = self.members
         # `returns` is indexed [ego, teammate]; best responses, K..2K-1, are the egos.
         known = memory.known | seen[k:, :k].T
