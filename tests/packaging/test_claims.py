@@ -26,7 +26,6 @@ from icrl4aht_generation.teammates.draws import DRAWS_PER_SEED
 from icrl4aht_generation.teammates.heuristics.territory import TERRITORY
 from icrl4aht_generation.teammates.instances import INSTANCES
 
-from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import (
     KEPT_STEPS,
     LABEL_EPISODES,
@@ -61,13 +60,6 @@ def bundled_entries() -> tuple[Entry, ...]:
 def count_rising_entries() -> tuple[float, ...]:
     rising = [entry for entry in bundled_entries() if entry.return_end - entry.return_start >= LEAST_HEADROOM]
     return len(rising), len(bundled_entries()), LEAST_HEADROOM
-
-
-def count_best_responses() -> tuple[int, int]:
-    found = read_best_responses().behaviours
-    assert {(len(one.seeds), one.split) for one in found} == {(1, "test")}
-    assert {training.width for one in found for training in one.seeds} == {64}
-    return len(found), len({one.layout for one in found})
 
 
 def count_cells_without_headroom() -> tuple[int, int]:
@@ -138,7 +130,11 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/evaluating", "canonical channels, the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
     ("docs/protocol", "choices.md): up to {} [drawn", max_validation_tasks_per_layout),
     ("docs/protocol", "scripts of {} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),
-    ("docs/protocol", "{} of its modes do not cooperate", lambda: TERRITORY.choices["behavior_mode"] - 1),
+    (
+        "docs/protocol",
+        "does not cooperate in {} of its {} modes",
+        lambda: (TERRITORY.choices["behavior_mode"] - 1, TERRITORY.choices["behavior_mode"]),
+    ),
     (
         "docs/protocol",
         "have {} behaviours in {} tasks (`cards/behaviours.json`). H4 has one behaviour on every layout. H1 "
@@ -183,7 +179,6 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
         "tasks {} learners 640 environment steps {} recorded transitions {} kept transitions {}",
         paper_plan_sizes,
     ),
-    ("docs/choices", "{} behaviours on {} layouts have a best response so far", count_best_responses),
     ("docs/choices", "plays on {} rearranged versions", lambda: reference.TRACK_PLAY["layout"]["rearranged"]),
 ]
 """Page, text with {} for each number, and what computes these numbers."""
