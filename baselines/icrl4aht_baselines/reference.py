@@ -93,7 +93,8 @@ class Recipe:
         histories: values of `HistoryOptions`.
         play: values of `PlayOptions`.
         profile: profile of the release that names the training teammates.
-        start: bundled model whose parameters for track `teammate` the training starts from; empty for random ones.
+        start: name of a bundled model; training starts with its parameters for track `teammate`, or with random
+            parameters if the name is empty.
         one_model: whether the same model plays all tracks, see `EVERY_TRACK`.
         own_round: whether a second training run follows, on the first histories and on histories that the model itself
             plays and RL^2 labels.

@@ -157,7 +157,7 @@ class Environment:
         return jax.vmap(lambda number, *own: function(self.tables_of(number), *own))(layout, *arguments)
 
     def tables_of(self, layout: Int[Array, ""] | None) -> Tables:
-        """Return the tables of the layout with the given number; None stands for the only layout."""
+        """Return the tables of a layout by its number, which may be None if there is only one layout."""
         # The compiler fuses this gather with later gathers, so no environment has its own copy of the tables.
         return self.tables if layout is None else jax.tree.map(lambda leaf: jnp.asarray(leaf)[layout], self.tables)
 

@@ -156,14 +156,10 @@ def kind_family(kind: str) -> str | None:
 
 
 def track_layouts(track: str, split: str) -> tuple[str, ...]:
-    """Return short names of a track's layouts in a split.
-
-    Registered and generated layouts belong to the tracks `layout` and `preference`.
-    """
-    added = added_layout_names() if track in ("layout", PREFERENCE) else ()
+    """Return short names of a track's layouts in a split; registered and generated layouts belong to track `layout`."""
     if track == PREFERENCE:
-        return (*PREFERENCE_LAYOUTS["train"], *(PREFERENCE_LAYOUTS["test"] if split == "test" else ()), *added)
-    return (*TRACKS[track][split], *added)
+        return PREFERENCE_LAYOUTS["train"] + (PREFERENCE_LAYOUTS["test"] if split == "test" else ())
+    return (*TRACKS[track][split], *(added_layout_names() if track == "layout" else ()))
 
 
 def track_of(layout: str) -> str:

@@ -142,7 +142,7 @@ class _Renderer:
         self._teammate_in_window = np.where(on_map, self._in_window[low % cells, high % cells], NOWHERE)
 
     def _make_cell_lookups(self) -> None:
-        """Make lookup tables for cells whose content can change: first pots, then buttons, then counters."""
+        """Make lookup tables for the cells that can change, in the order pots, buttons, counters."""
         layout, where = self._layout, self._columns
         pots, buttons, counters = map(len, (layout.pots, layout.buttons, layout.counters))
         self._pots = pots

@@ -91,7 +91,7 @@ def _packed_words(tables: Tables, record: Array, agent: int) -> tuple[Array, Arr
 
     bodies = 1 | xp.astype(1 << (xp.astype(state.facings, xp.uint32) + 1), xp.uint32)
     bodies = bodies | xp.astype(state.hands, xp.uint32) << 5
-    # At most one agent is on a cell, and no agent is on NOWHERE, which stands for any cell outside the map.
+    # NOWHERE is the number of all cells outside the map. A cell has at most one agent, and NOWHERE has none.
     cell, none = view >> CELL_BIT, xp.zeros_like(cells)
     agents = xp.where(cell == me[..., None], bodies[..., agent, None], none) | xp.where(
         cell == other[..., None], bodies[..., 1 - agent, None] << AGENT_BITS, none

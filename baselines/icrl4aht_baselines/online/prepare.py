@@ -274,7 +274,7 @@ def _training_record(
 ) -> list[dict[str, Any]]:
     """Return the record of training data for the tasks that are played; see `training_cells`.
 
-    Tasks without histories get separate entries, whose source is `TASKS_SOURCE`.
+    The entries of tasks without histories have the source `TASKS_SOURCE`.
     """
     found = []
     if dataset is not None:

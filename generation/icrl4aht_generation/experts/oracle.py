@@ -219,9 +219,9 @@ class OracleView:
 
     @cached_property
     def spoiled_pots(self) -> Bool[Array, " P"]:
-        """Partly filled pots whose contents fit no recipe that the ego should cook.
+        """Partly filled pots with ingredients that the ego cannot complete to a recipe that it should cook.
 
-        The mask is empty if the ego cannot serve, and while a soup of the current recipe is in stock.
+        No pot counts if the ego cannot serve, or while a soup of the current recipe is in stock.
         """
         nowhere = self.facts.pots & ~self.full & (self.contents > 0) & (jnp.min(self.plan_costs, axis=1) == NEVER)
         return nowhere & (self.stock[0] == 0) & self.facts.serves
@@ -233,7 +233,7 @@ class OracleView:
 
     @cached_property
     def teammate_pots(self) -> Bool[Array, " P"]:
-        """Pots that the ego leaves to the teammate: at most the pot whose soup of the current recipe is done first.
+        """The pot that the ego leaves to the teammate, if any: the one whose soup of the current recipe is done first.
 
         The ego leaves no pot to a teammate that does not cook or is idle.
         """
@@ -385,7 +385,7 @@ def _ingredient_subgoals(view: OracleView) -> list[Subgoal]:
     return [
         # Put the ingredient into the pot with the lowest cost of walking and cooking.
         Subgoal(holds, view.cost_at_pots(plans < NEVER, plans)),
-        # Fill up a pot whose contents fit no recipe, because only the soup of a full pot can be taken out.
+        # Fill up a pot with useless contents, because only a full pot can be emptied.
         Subgoal(holds & ~jnp.any(fits), view.cost_at_pots(view.spoiled_pots)),
         # Wait at the pot, because only the teammate serves.
         Subgoal(holds & ~view.facts.serves, view.cost_at_pots(view.full | view.mate_delivers)),
@@ -436,7 +436,7 @@ def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
         plate_subgoal(right),
         # Empty a pot that blocks the current recipe.
         plate_subgoal(wrong),
-        # Fill up a pot whose contents fit no recipe.
+        # Fill up a pot with useless contents, to empty it later.
         Subgoal(empty & jnp.any(view.spoiled_pots), any_ingredient),
         # An ego that only fills pots holds an ingredient ready for the next soup.
         Subgoal(empty & (jnp.any(view.full) | view.mate_delivers) & ~facts.serves, any_ingredient),

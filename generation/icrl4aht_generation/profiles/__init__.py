@@ -60,7 +60,6 @@ class _Generated(Struct, forbid_unknown_fields=True):
     Attributes:
         family, seed, count, split: arguments of `generate_layouts`.
         teammates: number of tasks of each layout in the sources "ppo" and "noise".
-        dishes: number of tasks in the source "search" of each layout on which the ego cannot see the recipe.
     """
 
     family: str
@@ -68,7 +67,6 @@ class _Generated(Struct, forbid_unknown_fields=True):
     seed: Natural = 0
     split: str = "train"
     teammates: Annotated[int, Meta(ge=0, le=16)] = 0
-    dishes: Annotated[int, Meta(ge=0, le=16)] = 0
 
 
 class _Tasks(Struct, forbid_unknown_fields=True):
@@ -159,30 +157,26 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
     check_version(release.data_version)
     layouts, sources = _layout_names("tasks.layouts", tasks.layouts), _check_distinct("tasks.sources", tasks.sources)
     generated: dict[str, int] = {}
-    dishes: dict[str, int] = {}
     for one in tasks.generated:
         found = add_layouts(generate_layouts(one.family, one.seed, one.count, split=one.split))
         names = _check_distinct("tasks.generated", [*generated, *(layout.name for layout in found)])
         generated |= dict.fromkeys(names[len(generated) :], one.teammates)
-        dishes |= {layout.name: one.dishes for layout in found if one.dishes and not layout.shows_recipe}
     layouts += tuple(generated)
     _check_known("source", "tasks.sources", sources, REBUILT_SOURCES)
     if not layouts and sources != ("search",):
         raise OptionError("tasks.layouts: expected layouts, found none; name layouts, or add tasks.generated")
     preference = PREFERENCE_LAYOUTS["train"] if tasks.preference == ("all",) else tasks.preference
     _check_known("layout of the track preference", "tasks.preference", preference, PREFERENCE_LAYOUTS["train"])
-    if bool(preference or dishes) != ("search" in sources):
+    if bool(preference) != ("search" in sources):
         raise OptionError(
-            f"tasks.preference = {list(tasks.preference)}, tasks.sources = {list(sources)}: the source "
-            f"search needs layouts in tasks.preference or dishes in tasks.generated; without this source, remove both"
+            f"tasks.preference = {list(tasks.preference)}, tasks.sources = {list(sources)}: expected layouts in "
+            f"tasks.preference if tasks.sources contains search, and none otherwise"
         )
     if "ppo" not in sources:
         release.keep = 0
     ego, ego_layouts = _read_section("ego", content.ego, PPOConfig(), layouts)
     noise, noise_layouts = _read_section("noise", content.noise, NoiseConfig(), layouts)
-    search, search_layouts = _read_section(
-        "search", content.search, SEARCH, _check_distinct("tasks.preference", (*preference, *dishes))
-    )
+    search, search_layouts = _read_section("search", content.search, SEARCH, preference)
     algorithms = _by_layout("tasks.algorithms", tasks.algorithms, layouts)
     for key, names in algorithms.items():
         _check_known("algorithm", "tasks.algorithms", _check_distinct(f"tasks.algorithms.{key}", names), ALGORITHMS)
@@ -195,7 +189,6 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
         search=search,
         scripted_layouts={"noise": noise_layouts, "search": search_layouts},
         generated=generated,
-        dishes=dishes,
         preference=_check_distinct("tasks.preference", preference),
         layouts=layouts,
         sources=sources,

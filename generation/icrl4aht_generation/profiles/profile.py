@@ -26,7 +26,6 @@ from icrl4aht_generation.layouts.families import split_of
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.teammates.draws import drawn_teammates
-from icrl4aht_generation.teammates.preference import training_dishes
 from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_teammate
 from icrl4aht_generation.teammates.spread import SPREAD_SEED, spread_teammates
 
@@ -154,8 +153,7 @@ class Profile:
         search: options of histories of the source "search".
         scripted_layouts: options by source and layout, for layouts with other values than `noise` or `search`.
         generated: number of sampled teammates by generated layout.
-        dishes: number of tasks of the source "search" by generated layout; each wants one dish in all episodes.
-        preference: published layouts of the source "search", which has the training and validation tasks of the track
+        preference: layouts of the source "search", which has the training and validation tasks of the track
             `preference` on these layouts.
         policies: whether the release contains the policies that label the histories.
         oracle_actions: whether the release contains the scripted oracle's action at every step.
@@ -186,7 +184,6 @@ class Profile:
     search: NoiseConfig = SEARCH
     scripted_layouts: dict[str, dict[str, NoiseConfig]] = field(default_factory=dict)
     generated: dict[str, int] = field(default_factory=dict)
-    dishes: dict[str, int] = field(default_factory=dict)
     preference: tuple[str, ...] = ()
     policies: bool = False
     oracle_actions: bool = False
@@ -231,7 +228,7 @@ class Profile:
 
     def layouts_of(self, source: str) -> tuple[str, ...]:
         """Return the names of a source's layouts."""
-        return (*self.preference, *self.dishes) if source == "search" else self.layouts
+        return self.preference if source == "search" else self.layouts
 
     def units(self, learned: Sequence[Task] = ()) -> list[Work]:
         """Return all units of work of the profile, by source and layout.
@@ -281,8 +278,6 @@ class Profile:
         return len(self._heuristic_tasks(layout, source)) + learned
 
     def _heuristic_tasks(self, layout: str, source: str) -> list[Task]:
-        if source == "search" and layout in self.dishes:
-            return self._dish_tasks(layout)
         if source == "search":
             first = _first_seed(source) + PREFERENCE_LAYOUTS["train"].index(layout) * _LAYOUT_SEEDS
             paths = (manifest_path(PREFERENCE, split) for split in ("train", "validation"))
@@ -299,7 +294,7 @@ class Profile:
         ]
         tasks = [_task_of_source(task, source) for task in tasks]
         if layout in self.generated:
-            first = _first_generated_seed(source, layout, self.generated)
+            first = _first_seed(source) + _GENERATED_SEEDS + list(self.generated).index(layout) * _LAYOUT_TEAMMATES
             return tasks + [
                 make_task(track, split, layout, entry, first + number)
                 for number, entry in enumerate(_generated_teammates(layout, split, self.generated))
@@ -311,42 +306,19 @@ class Profile:
             make_task(track, split, layout, entry, _drawn_task_seed(layout, source, entry)) for split, entry in entries
         ]
 
-    def _dish_tasks(self, layout: str) -> list[Task]:
-        """Return tasks with one wanted dish each on a generated layout; teammate families and dishes take turns."""
-        split, wanted = split_of(get_layout(layout)), training_dishes(get_layout(layout))
-        first, numbers = _first_generated_seed("search", layout, self.dishes), _generated_numbers(layout, self.dishes)
-        mates = _generated_teammates(layout, split, self.dishes)
-        # The shift by number // 4 makes every family occur with every dish.
-        dishes = [wanted[(number + number // len(HEURISTIC_KINDS)) % len(wanted)] for number in numbers]
-        return [
-            make_task(PREFERENCE, split, layout, mate, seed, [dish])
-            for seed, (mate, dish) in enumerate(zip(mates, dishes, strict=True), first)
-        ]
-
     @property
     def hash(self) -> str:
         """Hash of all settings of the profile."""
         return json_hash(asdict(self))
 
 
-def _generated_numbers(layout: str, generated: Mapping[str, int]) -> range:
-    """Return the task numbers of a generated layout, which continue those of the previous generated layouts."""
-    first = sum(generated[name] for name in takewhile(layout.__ne__, generated))
-    return range(first, first + generated[layout])
-
-
 def _generated_teammates(layout: str, split: str, generated: Mapping[str, int]) -> list[dict[str, Any]]:
     """Return the sampled teammates of a generated layout; the families take turns over all generated layouts."""
-    kinds = list(HEURISTIC_KINDS)
+    first, kinds = sum(generated[name] for name in takewhile(layout.__ne__, generated)), list(HEURISTIC_KINDS)
     return [
         sample_teammate(kinds[number % len(kinds)], number // len(kinds), "diverse", _GENERATED_DRAWS[split])
-        for number in _generated_numbers(layout, generated)
+        for number in range(first, first + generated[layout])
     ]
-
-
-def _first_generated_seed(source: str, layout: str, generated: Mapping[str, int]) -> int:
-    """Return the first seed for a source's tasks on a generated layout; other layouts have other seeds."""
-    return _first_seed(source) + _GENERATED_SEEDS + list(generated).index(layout) * _LAYOUT_TEAMMATES
 
 
 def _drawn_task_seed(layout: str, source: str, entry: Mapping[str, Any]) -> int:

@@ -98,7 +98,7 @@ class TeammateFacts(NamedTuple):
 
     Attributes:
         references: returns of the reference egos with the teammate.
-        nearest: the test teammate, of any family, whose behaviour is most similar; None if unknown.
+        nearest: the test teammate that behaves most similarly, from all families; None if unknown.
     """
 
     references: ReferenceEgos

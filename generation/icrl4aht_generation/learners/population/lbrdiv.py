@@ -69,7 +69,7 @@ class LBRDiv(Algorithm):
     def adapt(self, memory: Multipliers, returns, seen) -> Multipliers:
         """Return new multipliers max(multiplier - eta (J(pi_i, BR_i) - J(other pair) - eps), 0).
 
-        The diagonal does not change, nor does a multiplier whose returns are unknown or not new.
+        Diagonal entries stay the same. The others change only if there are new episodes and both returns are known.
         """
         k = self.members
         # `returns` is indexed [ego, teammate]; best responses, K..2K-1, are the egos.

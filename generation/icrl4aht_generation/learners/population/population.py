@@ -40,8 +40,8 @@ class Assignment(NamedTuple):
         term: int (2, N), number of the term that each slot samples; -1 for slots from which no policy learns.
         group: int (P,), group of each policy: a pair from one group is self-play, any other pair is cross-play.
         learning: number L of policies that learn.
-        starts_from: int (N,), number of the environment whose visited states start the episodes; -1 for episodes with
-            the usual start.
+        starts_from: int (N,), the environment that provides the start states of episodes, from the states visited
+            there; -1 if episodes have the layout's own start.
     """
 
     policy: np.ndarray
