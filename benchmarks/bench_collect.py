@@ -29,13 +29,13 @@ from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.collection.task import make_learner
 from icrl4aht_generation.collection.task_folder import last_timing
 from icrl4aht_generation.learners.config import Widths
-from icrl4aht_generation.profiles import Profile, Work, load_profile
+from icrl4aht_generation.profiles import Profile, WorkUnit, load_profile
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.teammates.registry import heuristic_teammate
 
 from benchmarks.harness import elapsed, folder_size, peak_memory, print_line
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, track_of
+from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, layout_track
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks
 from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.format.schema import KINDS, TASKS
@@ -51,7 +51,7 @@ class _StopCollectionError(Exception):
 
 
 def collect_updates(profile: Profile, updates: int, save_seconds: float) -> dict[str, float]:
-    """Collect the profile's last task with a heuristic teammate for `updates` updates, and return the timing."""
+    """Collect `updates` updates of the profile's last task with a heuristic teammate, and return the timing."""
     work = _last_heuristic_work(profile)
 
     def report(done: int, speed: float) -> None:
@@ -65,8 +65,8 @@ def collect_updates(profile: Profile, updates: int, save_seconds: float) -> dict
         return last_timing(job.folder) or {}
 
 
-def _last_heuristic_work(profile: Profile) -> Work:
-    """Return the unit of work that collects the profile's last task with a heuristic teammate."""
+def _last_heuristic_work(profile: Profile) -> WorkUnit:
+    """Return the unit of work for the profile's last task with a heuristic teammate."""
     return replace(profile, presets=("default",)).units()[-1]
 
 
@@ -87,9 +87,9 @@ def noise_speed(layout: str) -> dict[str, Any]:
     """Return the speed of collecting noise histories with an H4 teammate, after a first task for compilation."""
     profile = replace(load_profile("smoke"), noise=_NOISE, sources=("noise",))
     mate = heuristic_teammate("utility_greedy", "default", 0)
-    tasks = [make_task(track_of(layout), "train", layout, mate, seed) for seed in range(2)]
+    tasks = [make_task(layout_track(layout), "train", layout, mate, seed) for seed in range(2)]
     with tempfile.TemporaryDirectory() as folder:
-        first, second = (elapsed(CollectionJob(Work(task, "noise"), profile, Path(folder)).run) for task in tasks)
+        first, second = (elapsed(CollectionJob(WorkUnit(task, "noise"), profile, Path(folder)).run) for task in tasks)
     transitions = _NOISE.histories * _NOISE.episodes * KEPT_STEPS
     return {
         "layout": layout,
@@ -100,7 +100,7 @@ def noise_speed(layout: str) -> dict[str, Any]:
 
 
 def collection_memory(updates: int) -> dict[str, Any]:
-    """Return the peak memory in MiB of a collection, and of its learner without recording, in separate processes."""
+    """Return the peak memory in MiB of a collection and of its learner alone, each measured in its own process."""
     peaks = []
     for recording in (False, True):
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:

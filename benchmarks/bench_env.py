@@ -107,10 +107,10 @@ def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
     return play
 
 
-def print_layouts(n: int, rounds: int) -> None:
+def compare_many_layouts(n: int, rounds: int) -> None:
     """Print the speed of n environments on n generated layouts and on one layout, and of JaxMARL on this layout.
 
-    Our observations have the canonical channels, which are more than the channels of this layout.
+    Our observations have all canonical channels, which are more channels than this layout needs.
     """
     one = get_layout(_ONE)
     many = generate_layouts("templates", 0, n // 2) + generate_layouts("rooms", 0, n - n // 2)
@@ -146,7 +146,7 @@ def main(
 ) -> None:
     """Compare steps/s of environments, or of learning in them, with JaxMARL; print one JSON line per setting."""
     if peer is None:
-        print_layouts(max(environments), rounds)
+        compare_many_layouts(max(environments), rounds)
     for layout, n in itertools.product(map(get_layout, layouts), environments):
         if peer is None:
             for what in written:

@@ -110,8 +110,8 @@ def gib(count: int) -> float:
     return round(count / 2**30, 3)
 
 
-def seconds_of_calls(call: Callable[[], Any], seconds: float, least: int = 3) -> list[float]:
-    """Return the durations of repeated calls, after a first call for warm-up, until `seconds` have passed."""
+def call_durations(call: Callable[[], Any], seconds: float, least: int = 3) -> list[float]:
+    """Call a function once for warm-up, then repeatedly for `seconds`. Return the durations of the repeated calls."""
     jax.block_until_ready(call())
     found: list[float] = []
     while len(found) < least or sum(found) < seconds:
@@ -128,7 +128,7 @@ def product_tflops(size: int, dtype: str, precision: str | None, seconds: float)
     def multiply_repeatedly() -> Any:
         return [multiply(one, two) for _ in range(5)]  # five products per call, so that overhead is negligible
 
-    return 5 * 2 * size**3 / min(seconds_of_calls(multiply_repeatedly, seconds)) / 1e12
+    return 5 * 2 * size**3 / min(call_durations(multiply_repeatedly, seconds)) / 1e12
 
 
 def describe_device(sizes: Sizes) -> dict[str, Any]:
@@ -169,7 +169,7 @@ def measure_learner(sizes: Sizes, encoder: EncoderKind) -> dict[str, Any]:
         state, _, metrics = program.call(state)
         return metrics
 
-    seconds = statistics.median(seconds_of_calls(update, sizes.seconds))
+    seconds = statistics.median(call_durations(update, sizes.seconds))
     return {
         **{name: getattr(config, name) for name in ("environments", "rollout", "minibatches", "epochs")},
         "steps_per_second": round(config.steps_per_update / seconds, 1),
@@ -215,9 +215,9 @@ def _measure_training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype
             state, log = program.call(state, take())
             return log
 
-        seconds = statistics.median(seconds_of_calls(partial(step, lambda: batch), sizes.seconds))
+        seconds = statistics.median(call_durations(partial(step, lambda: batch), sizes.seconds))
         before = batches.waited
-        loaded = seconds_of_calls(partial(step, partial(next, batches)), sizes.seconds)
+        loaded = call_durations(partial(step, partial(next, batches)), sizes.seconds)
         waited = (batches.waited - before) / (len(loaded) + 1)
     transitions = sizes.batch * length
     return {
@@ -252,7 +252,7 @@ def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) ->
     filling, shortest = -(-context // sizes.episode_steps), 2 * -(-context // 5 // sizes.episode_steps)
     for _ in islice(episodes, filling):  # fill the windows; a full window drops a fifth of its steps
         pass
-    seconds = seconds_of_calls(partial(next, episodes), sizes.seconds, least=max(3, shortest))
+    seconds = call_durations(partial(next, episodes), sizes.seconds, least=max(3, shortest))
     streams, episode_seconds = len(tasks) * seeds, statistics.mean(seconds)
     return {
         "context": context,
@@ -333,21 +333,21 @@ def stop_at_limit(pending: Sequence[str]) -> None:
 @click.option("--seconds", type=float, help="Least time of a measurement.  [default: 4, or 0.05 for tiny sizes]")
 def main(parts: tuple[str, ...], cases: tuple[str, ...], minutes: float, small: bool, seconds: float | None) -> None:
     """Measure the speed of learning, training and evaluation on a GPU, and print a JSON line for each case."""
-    if "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:  # JAX accepts only one of the two variables
-        os.environ.setdefault("XLA_CLIENT_MEM_FRACTION", "0.92")  # share of the GPU's memory; the default is less
+    if "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:  # JAX accepts only this variable or the next one
+        os.environ.setdefault("XLA_CLIENT_MEM_FRACTION", "0.92")  # share of the GPU's memory, above JAX's default
     pending = [name for name in CASES if (name in cases if cases else name.split("/")[0] in parts)]
     limit = Timer(60 * minutes, stop_at_limit, [pending])
-    limit.daemon = True  # so that an interrupted command ends at once
+    limit.daemon = True  # an interrupted command does not wait for a daemon thread
     limit.start()
     sizes = FULL_SIZES
     if small or jax.default_backend() == "cpu":
         sizes = SMALL_SIZES
-        jax.config.update("jax_disable_most_optimizations", True)  # otherwise compilation takes nearly all of the time
+        jax.config.update("jax_disable_most_optimizations", True)  # optimizing would take nearly all of the time
     sizes = replace(sizes, seconds=sizes.seconds if seconds is None else seconds)
     failed = False
     while pending:
         failed |= not run_case(pending[0], sizes)
-        del pending[0]  # after the case, so that `stop_at_limit` also prints a line for a running case
+        del pending[0]  # only now, so that `stop_at_limit` prints a line for a case that is still running
     limit.cancel()
     sys.exit(int(failed))
 

@@ -48,7 +48,7 @@ from icrl4aht_generation.teammates.registry import build_teammate, heuristic_tea
 from benchmarks.bench_loader import published_reader
 from benchmarks.harness import compare_rates, compiled_call, elapsed, measure_rates, print_line
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark.facts import TRACKS, track_of
+from icrl4aht_data.benchmark.facts import TRACKS, layout_track
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.dataset import Dataset
@@ -81,7 +81,7 @@ def ego_updates(layout: Layout, config: PPOConfig) -> Callable[[], None]:
     return run
 
 
-def compare_egos(layout: Layout, configs: dict[str, PPOConfig], rounds: int) -> None:
+def compare_ego_profiles(layout: Layout, configs: dict[str, PPOConfig], rounds: int) -> None:
     """Print steps/s of training an ego with each profile, and the ratio to the first profile."""
     ways = {name: ego_updates(layout, config) for name, config in configs.items()}
     steps = {name: _UPDATES * config.steps_per_update for name, config in configs.items()}
@@ -116,7 +116,7 @@ def compare_jaxmarl(script: Path, layout: Layout, environments: int, rounds: int
 
 
 def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
-    """Yield batches of a sampler's windows, which are read from `folder` in the way of the published code.
+    """Yield the batches of a sampler, but read their windows from `folder` as the published code does.
 
     The action and the reward before a window are zeros, since speed does not depend on these values.
     """
@@ -139,7 +139,7 @@ def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
 
 
 def ad_method(size: str, layouts: Sequence[Layout], view: BatchView | None = None, **changes: Any) -> Method:
-    """Return the method AD with a named model size for some layouts; `changes` replace options of the size."""
+    """Return the method AD for some layouts with the options of a model size; `changes` replace single options."""
     model = ModelOptions(**SIZES[size].model | changes)
     return get_method("ad")(model, overcooked_world(layouts, model.encoder, view))
 
@@ -201,8 +201,8 @@ def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -
 
 def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int) -> None:
     """Print the steps/s of a model with `cached` acting on up to `most` tasks, and their ratio to `exact` acting."""
-    tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
-    dropped = dropped_steps(SIZES[size].train["context"])  # number of steps after which the window is computed again
+    tasks = [task for task in published_tasks(layout_track(layout.name)) if task.layout == layout][:most]
+    dropped = dropped_steps(SIZES[size].train["context"])  # steps after which cached acting recomputes its window
     lengths: dict[Acting, int] = {"cached": dropped * -(-10 * steps // dropped), "exact": steps}
     ways = {acting: acting_steps(tasks, size, acting, n) for acting, n in lengths.items()}
     rates = measure_rates(ways, {acting: n * len(tasks) for acting, n in lengths.items()}, rounds)
@@ -253,10 +253,10 @@ def main(
     parts, here = parts or tuple(part for part in PARTS_OF_LEARNING if peer or part != "jaxmarl"), get_layout(layout)
     loaded = {profile.name: profile for profile in map(load_profile, profiles)}
     threads = [profile.xla_threads for profile in loaded.values() if profile.xla_threads]
-    if threads and set(parts) == {"ego"}:  # other parts need all cores
+    if threads and set(parts) == {"ego"}:  # the other parts of this benchmark need all cores
         limit_xla_threads(threads[-1])
     if "ego" in parts:
-        compare_egos(here, {name: profile.ego for name, profile in loaded.items()}, rounds)
+        compare_ego_profiles(here, {name: profile.ego for name, profile in loaded.items()}, rounds)
     if "jaxmarl" in parts and peer:
         compare_jaxmarl(peer, here, numbers["environments"], rounds)
     dataset = load_icrl4aht(split="train", source="ppo", layout=here.name, obs="state")[:8]

@@ -138,7 +138,7 @@ def batch_seconds(sampler: ADSampler, buffer: ADBatch | None, cache: str, first:
 def compare_readers(folder: Path, batch: int, length: int, rounds: int, threads: int, peer_windows: int) -> None:
     """Compare the windows per second of our sampler with those of `published_reader` and `fair_reader`.
 
-    Our sampler is measured with each cache and form of observations.
+    Our sampler is measured with each combination of cache mode and observation type.
     """
     dataset: Any = load_icrl4aht(folder / "lite", threads=threads)
     windows_of = dataset.ad(batch_size=batch, length=length, seed=1).windows

@@ -85,7 +85,7 @@ class MeasuredProgram(NamedTuple):
 
 
 def compile_measured(function: Any, *arguments: Any, **options: Any) -> MeasuredProgram:
-    """Compile a jitted function for some arguments with options of XLA, and measure its costs."""
+    """Compile a jitted function for given arguments and XLA options, and measure its costs."""
     started = time.perf_counter()
     traced = function.trace(*arguments)
     compiled = traced.lower().compile(compiler_options=options)

@@ -74,7 +74,7 @@ class HubClient:
 
     @contextmanager
     def connect(self) -> Iterator[None]:
-        """Return a context manager in which a request, with retries, fails after `_TIMEOUT` seconds without a response.
+        """Return a context manager that limits the wait for a response, over all retries, to `_TIMEOUT` seconds.
 
         Two hooks set this limit. Without a limit, huggingface_hub waits forever for some responses, and five times 60 s
         for others.
@@ -206,7 +206,7 @@ def _open_filesystem(address: str) -> Any:
         problem = f"{shown}: not an address that fsspec opens: {without_credentials(str(error))}"
         raise OptionError(f"{problem}; expected hf://datasets/<org>/<repo>, https://... or s3://...") from None
     if scheme == "s3":
-        files.retries = 1  # s3fs has retries in addition to those of botocore
+        files.retries = 1  # s3fs also retries, in addition to botocore
     return files
 
 
@@ -246,14 +246,14 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
 
 
 def _root_cause(error: BaseException) -> BaseException:
-    """Return the error behind a FileNotFoundError, which clients raise if any request for a file's size fails."""
+    """Return the cause of a FileNotFoundError: clients raise this error if any request for a file's size fails."""
     while isinstance(error, FileNotFoundError) and error.__cause__ is not None:
         error = error.__cause__
     return error
 
 
 def _http_status(error: BaseException | None) -> int | None:
-    """Return the HTTP status of an error of aiohttp or httpx, or of the error's cause; None without a response."""
+    """Return the HTTP status in an error of aiohttp or httpx, or in its cause; None if no response arrived."""
     if error is None:
         return None
     status = getattr(getattr(error, "response", None), "status_code", getattr(error, "status", None))

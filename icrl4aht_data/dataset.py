@@ -148,7 +148,8 @@ class Dataset(Selection):
         Args:
             names: fields of `Entry`, such as "return_end"; the first field is the main key. Text is sorted
                 alphabetically.
-            reverse: sort from the largest value to the smallest. Histories without a value are last in either order.
+            reverse: sort from the largest value to the smallest. Histories without a number are last in either order;
+                missing text counts as "".
 
         Raises:
             OptionError: if no field is given, or an argument is not a string.
@@ -171,8 +172,8 @@ class Dataset(Selection):
     def split(self, validation: float = 0.1, seed: int = 0, by: SplitBy = "teammate") -> tuple[Self, Self]:
         """Split this selection into training and validation histories.
 
-        The split depends on names and the seed, not on the order of the selection. `icrl4aht-data train` splits
-        releases without a validation split in the same way.
+        The split depends on the seed and on the names of teammates or histories, not on the order of the selection.
+        `icrl4aht-data train` splits releases without a validation split in the same way.
 
         Args:
             validation: fraction of the teammates, or of the histories, to hold out; at least one is held out.
@@ -419,7 +420,7 @@ def _check_episode(entry: Entry, episode: int) -> int:
 
 
 def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | None:
-    """Return the sorted teammate ids of some histories, or None if the release does not describe all teammates.
+    """Return the sorted teammate ids of some histories, or None if the release does not describe their teammates.
 
     See `tasks.teammate_id`.
     """
@@ -434,10 +435,11 @@ def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | No
 
 
 def teammate_names(dataset: Dataset) -> np.ndarray:
-    """Return a name for each history's teammate, strings (H,), equal for the same policy on the same layout.
+    """Return a name for each history's teammate, as strings of shape (H,).
 
-    A name consists of layout and teammate id, or is the task id if the release does not describe the teammate.
-    Teammates that take turns within a history share one name.
+    Teammates with the same policy on the same layout have equal names. A name consists of layout and teammate id, or
+    is the task id if the release does not describe the teammate. Teammates that take turns within a history share one
+    name.
     """
     codes, first, number = np.unique(dataset.column_codes("task_id"), return_index=True, return_inverse=True)
     values, of_task = dataset.index.values("task_id"), list[str]()

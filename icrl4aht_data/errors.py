@@ -131,7 +131,7 @@ class TaskFormatError(Icrl4ahtError, ValueError):
 
 
 class WeakLabelsWarning(UserWarning):
-    """The policy that chose some tasks' labels earns less than half of the ego's return at the end of the histories."""
+    """The policy that labelled some tasks earns less than half of the ego's return at the end of the histories."""
 
 
 class MixedSplitsWarning(UserWarning):

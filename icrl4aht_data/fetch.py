@@ -1,4 +1,4 @@
-"""Remote releases: complete files are downloaded, checked once against the manifest, and then stay on this machine.
+"""Remote releases: each file is downloaded completely, checked once against the manifest, and kept on this machine.
 
 The files of a remote release are stored in a local folder. For `hf://`, this is the snapshot in the Hub's cache, which
 other tools share; for any other address, a folder in `system.data_folder`, one per version. A file is accepted only if
@@ -44,7 +44,7 @@ _HUB = re.compile(r"hf://datasets/(?P<repo>[\w.-]+/[\w.-]+)(?:@(?P<revision>[^@]
 
 
 def is_address(root: str | Path | None) -> bool:
-    """Return whether a root is the address of a remote release, not a local folder."""
+    """Return whether `root` is the address of a remote release, not a local folder."""
     return isinstance(root, str) and "://" in root and not root.startswith("file://")
 
 
@@ -70,7 +70,7 @@ class ReleaseLocation:
         return disk.resolve_inside(self.folder, name)
 
     def fetch(self, names: Iterable[str]) -> None:
-        """Download missing files; for a local release, nothing is downloaded, since all of its files are present."""
+        """Download missing files of a remote release; do nothing for a local folder."""
 
     def file(self, name: str) -> Path:
         """Return the path of a file, downloaded if necessary; local files in meta/ are checked against the manifest.
@@ -151,7 +151,7 @@ class Remote(ReleaseLocation):
         with ExitStack() as stack:
             scratch = None
             if not self.in_hub_cache:  # the Hub's client locks its own cache
-                stack.enter_context(disk.process_lock(disk.lock_path(self.folder)))
+                stack.enter_context(disk.process_lock(disk.lock_file_path(self.folder)))
                 absent = [name for name in absent if again or not self.is_downloaded(name)]
                 for left in self.folder.glob(".partial-*"):  # left by a killed download
                     shutil.rmtree(left, ignore_errors=True)
@@ -170,7 +170,7 @@ class Remote(ReleaseLocation):
         """Download a file, and move it to its final path if its hash is the one in the manifest."""
         address, target = f"{self.url}/{name}", self.path(name)
         if scratch is None:
-            _remove_from_cache(target)  # else the client would keep the cached file
+            _remove_from_cache(target)  # otherwise the client would keep the cached file
         most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else disk.LARGEST
         path = _fetch_with_retries(self.client, address, name, scratch, advance, most)
         size, found = path.stat().st_size, disk.file_hash(path)
@@ -187,7 +187,7 @@ class Remote(ReleaseLocation):
             path.replace(target)
 
     def is_downloaded(self, name: str, by_hash: bool = False) -> bool:
-        """Return whether a file is present and has the hash in the manifest; for shards only the size is compared.
+        """Return whether a file is present and has the hash in the manifest; shards are compared only by size.
 
         Args:
             name: file of the release.
@@ -215,7 +215,7 @@ class Remote(ReleaseLocation):
 
     @cached_property
     def manifest(self) -> dict[str, str]:
-        """SHA-256 of each file, hexadecimal, by path in the release."""
+        """Hexadecimal SHA-256 of each file, by path in the release."""
         return dict(read_manifest(self.folder))  # unlike a MappingProxyType, a dict can be pickled
 
     @cached_property
@@ -231,7 +231,7 @@ def _offline_advice() -> str:
 def _fetch_with_retries(
     client: HubClient | FsspecClient, address: str, name: str, scratch: Path | None, advance: Advance, most: int
 ) -> Path:
-    """Download a file of at most `most` bytes, with retries; the numbers for `advance` add up to the file's size."""
+    """Download a file of at most `most` bytes, with retries; `advance` receives counts that add up to its size."""
     arrived = 0
 
     def count(size: int) -> None:
@@ -257,7 +257,7 @@ def _remove_from_cache(path: Path) -> None:
 
 
 def check_root(root: Any) -> None:
-    """Check that a root is a path, or a string without null characters.
+    """Check that `root` is a path or a string, without null characters.
 
     Raises:
         OptionError: for any other value.
@@ -314,7 +314,7 @@ def _open_address(address: str, to: Path | None) -> Remote:
     check_credentials(address)
     client, url = FsspecClient(address), without_credentials(address).rstrip("/")
     base = data_folder() / f"{re.sub(r'[^A-Za-z0-9.]+', '-', url)[:80]}-{disk.short_hash(url.encode(), 8)}"
-    latest = base / "latest"  # contains the folder name of the version opened last
+    latest = base / "latest"  # file with the folder name of the version opened last
     if offline_switches():
         path = (to or base / (latest.read_text() if latest.is_file() else "none")) / MANIFEST
         if not path.is_file():
@@ -327,7 +327,7 @@ def _open_address(address: str, to: Path | None) -> Remote:
             _, text = _fetch_manifest(client, url, Path(scratch))
         if to is None:
             (base / disk.short_hash(text)).mkdir(parents=True, exist_ok=True)
-            with disk.process_lock(disk.lock_path(latest)):
+            with disk.process_lock(disk.lock_file_path(latest)):
                 disk.write_atomically(latest, disk.short_hash(text))
     folder = to or base / disk.short_hash(text)
     _prepare_folder(folder, text, url, is_ours=to is None)
@@ -363,7 +363,7 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
 
     if has_manifest():
         return
-    with disk.process_lock(disk.lock_path(folder)):  # another process may be writing the manifest
+    with disk.process_lock(disk.lock_file_path(folder)):  # another process may be writing the manifest
         if has_manifest():
             return
         if folder.exists() and any(folder.iterdir()) and not is_ours:
@@ -374,7 +374,7 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
 
 @dataclass(frozen=True)
 class DownloadPlan:
-    """Plan of a download: a release's requested files, and which of the files are absent or changed.
+    """Plan of a download: the requested files of a release, and the names of absent and of changed files.
 
     Args:
         root: the remote release.

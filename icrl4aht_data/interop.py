@@ -105,14 +105,14 @@ def torch_loader(
     return loader(
         sampler,
         batch_size=None,
-        sampler=_PassSampler(numbers, per_pass if stop is None else len(numbers)),
+        sampler=_BatchNumberSampler(numbers, per_pass if stop is None else len(numbers)),
         num_workers=check_int("workers", workers, 0),
         **{"collate_fn": _to_tensors, **processes, **options},
     )
 
 
 def _batch_numbers(sampler: Sampler, start: int, stop: int | None) -> range:
-    """Return the range of batch numbers start..stop; `stop` is `len(sampler)` by default.
+    """Return the range of batch numbers from `start` to `stop` - 1; `stop` is `len(sampler)` by default.
 
     Raises:
         OptionError: if `sampler` is not a sampler, or a number is out of range.
@@ -123,7 +123,7 @@ def _batch_numbers(sampler: Sampler, start: int, stop: int | None) -> range:
     return range(start, len(sampler) if stop is None else check_int("stop", stop, start))
 
 
-class _PassSampler:
+class _BatchNumberSampler:
     """Sampler of batch numbers for a DataLoader; each iteration continues after the previous one.
 
     Args:
@@ -212,7 +212,7 @@ def render_observations(
         obs: dtype of the observations.
 
     Returns:
-        Array (T, 5, 5, C) for one row with an episode of T steps; (B, T, 5, 5, C) for B rows.
+        Array of shape (T, 5, 5, C) for one row with an episode of T steps, or (B, T, 5, 5, C) for B rows.
 
     Raises:
         UnknownNameError: for channels, a dtype or a layout that does not exist.
@@ -241,7 +241,7 @@ def render_observations(
         raise OptionError(f"state: expected bytes of equally long episodes: {error}") from error
     longest = record_width(layouts)
     if records.ndim != 3 or records.shape[-1] < longest:
-        raise OptionError(f"state: expected (B, T, S) with S at least {longest}, found {records.shape}")
+        raise OptionError(f"state: expected shape (B, T, S) with S at least {longest}, found {records.shape}")
     out = new_array((*records.shape[:2], *next(iter(shapes))), obs, f"observations of {len(layouts)} episodes")
     for layout, record, seen in zip(layouts, records, out, strict=True):
         fast_observe(layout, record[:, : record_size(layout)], seen, canonical=canonical)
@@ -263,7 +263,7 @@ def _read_column(rows: Mapping[str, Any] | Sequence[Mapping[str, Any]], name: st
 
 
 def hf_windows(sampler: Sampler, start: int = 0, stop: int | None = None) -> datasets.IterableDataset:
-    """Return the rows of batches start..stop as a `datasets.IterableDataset`, with a column for each batch field.
+    """Return the rows of batches `start` to `stop` - 1 as a `datasets.IterableDataset`, one column per batch field.
 
     Integers are int64, and `target_actions` are -100 on padding, as in `torch_loader`. Rows hold NumPy arrays of the
     batch's dtypes. The result declares no `features`: with features, `datasets` would convert one-dimensional arrays to

@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.actions import DOWN
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import draw_frame, encode_episode
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
-from icrl4aht_data.overcooked.state import start_record
+from icrl4aht_data.overcooked.state import initial_record
 from icrl4aht_data.utils.files import atomic_write, write_atomically
 from icrl4aht_data.utils.install_hints import import_optional, install_command
 from icrl4aht_data.utils.text import counted_histories
@@ -94,7 +94,7 @@ def running_mean(values: np.ndarray, window: int) -> np.ndarray:
     return (sums[stop] - sums[start]) / (stop - start)
 
 
-def return_limits(values: Iterable[float]) -> tuple[float, float]:
+def axis_limits(values: Iterable[float]) -> tuple[float, float]:
     """Return the limits of a plot axis that shows 0 and all given returns, and spans at least one delivery's reward.
 
     Small variations of an almost constant return are therefore not magnified.
@@ -123,7 +123,7 @@ def plot_history(returns: np.ndarray, title: str, expert_return: float | None = 
     axes.plot(episodes, running_mean(returns, window), color="C0", label=f"running mean over {window}")
     if expert_return is not None:
         axes.axhline(expert_return, color="C1", linestyle="--", linewidth=1, label="expert, acting greedily")
-    axes.set_ylim(*return_limits([*map(float, returns), expert_return or 0.0]))
+    axes.set_ylim(*axis_limits([*map(float, returns), expert_return or 0.0]))
     axes.set_title(title, fontsize=9)
     axes.set_xlabel("episode")
     axes.set_ylabel("return of the kept steps")
@@ -218,9 +218,9 @@ def plot_source_curves(curves: SourceCurves) -> Figure:
         axes.tick_params(which="both", labelsize=7)
         axes.grid(alpha=0.3)
     for axes in grid:
-        axes.set_ylim(*return_limits(ends))
+        axes.set_ylim(*axis_limits(ends))
     figure.suptitle("Return of the kept steps by episode (band: 10th to 90th percentile of histories)", fontsize=9)
-    legend_below(figure)
+    add_legend_below(figure)
     return figure
 
 
@@ -251,7 +251,7 @@ def plot_layouts(layouts: Sequence[Layout], titles: Sequence[str] | None = None)
     titles = titles or [f"{layout.name} ({layout.alias})" for layout in layouts]
     for axes, layout, title in zip(grid, layouts, titles, strict=True):
         positions = np.array([layout.agent_cells], np.uint8)
-        (record,) = start_record(layout, positions, np.full((1, 2), DOWN, np.uint8), layout.recipe_items[:1])
+        (record,) = initial_record(layout, positions, np.full((1, 2), DOWN, np.uint8), layout.recipe_items[:1])
         axes.imshow(draw_frame(layout, record, view=False))
         axes.set_title(title, fontsize=9)
         axes.set_axis_off()
@@ -294,7 +294,7 @@ def new_figure(width: float, height: float) -> Figure:
     return import_optional("matplotlib.figure", "drawing").Figure(figsize=(width, height), layout="constrained")
 
 
-def legend_below(figure: Figure) -> None:
+def add_legend_below(figure: Figure) -> None:
     """Add one legend of all axes at the bottom of a figure, in as many columns as fit its width, at most 5."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 

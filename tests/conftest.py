@@ -34,7 +34,7 @@ SharedFolder = Callable[[str, Callable[[Path], object]], Path]
 COMPILATION_CACHE: dict[str, Any] = {
     "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".cache" / "jax"),
     "jax_compilation_cache_max_size": 2 * 2**30,  # with a limit, JAX locks the folder, so processes can share the cache
-    "jax_persistent_cache_min_compile_time_secs": 0.1,  # 0.5 would cost 50% more CPU time with a filled cache
+    "jax_persistent_cache_min_compile_time_secs": 0.1,  # with 0.5, tests take 50% more CPU time (cache filled)
 }
 COSTLIEST = """
 collect notebooks wheel reference heuristics scripted rl2 suite generate run fetch gymnasium_env docs models trainer
@@ -64,7 +64,7 @@ def pytest_configure() -> None:
     jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
     os.environ.setdefault(
         "PJRT_NPROC", "1"
-    )  # one thread, as in the profiles of tests; JAX reads this variable when it starts
+    )  # one thread, as in the package's profiles for CPUs; read when JAX is first used
     for name, value in COMPILATION_CACHE.items():
         jax.config.update(name, value)
         os.environ[name.upper()] = str(value)
@@ -73,7 +73,7 @@ def pytest_configure() -> None:
 
 
 def _remove_unfinished_entries(folder: Path) -> None:
-    """Remove cache entries that killed processes left without access-time file, because such entries block new ones."""
+    """Remove cache entries without an access-time file, left by killed processes, since they block new entries."""
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / ".lockfile"):
         for entry in folder.glob("*-cache"):
@@ -106,9 +106,9 @@ def temporary_cache(tmp_path_factory) -> None:
 
 @pytest.fixture(scope="session")
 def shared_folder(tmp_path_factory) -> SharedFolder:
-    """Return a function that returns the folder of a given name (read-only).
+    """Return a function (name, make) that returns a folder shared by all test workers (read-only).
 
-    The first test worker that asks for a folder calls the given function to fill it.
+    The first worker that asks for the folder `name` fills it by calling `make`.
     """
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base

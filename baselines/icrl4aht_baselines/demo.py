@@ -28,7 +28,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.dataset import MINI, load_icrl4aht
 from icrl4aht_data.errors import ReleaseError
-from icrl4aht_data.plotting import check_can_draw, legend_below, save_figure
+from icrl4aht_data.plotting import add_legend_below, check_can_draw, save_figure
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 
@@ -177,5 +177,5 @@ def draw_adaptation(runs: Sequence[EvaluationRun], path: Path) -> None:
         axes.plot(np.arange(1, len(returns) + 1), returns, marker=".", label=label, **style)
     axes.set_ylabel("return of an episode", fontsize=8)
     axes.axhline(0, color="gray", linewidth=0.6)
-    legend_below(figure)
+    add_legend_below(figure)
     save_figure(figure, path)

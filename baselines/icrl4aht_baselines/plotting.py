@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from icrl4aht_data.plotting import MOST_PANELS, legend_below, new_figure, return_limits, running_mean, save_figure
+from icrl4aht_data.plotting import MOST_PANELS, add_legend_below, axis_limits, new_figure, running_mean, save_figure
 
 
 def plot_training_log(metrics: Path, path: Path, title: str) -> None:
@@ -33,7 +33,7 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
     curves = numbers.groupby(["panel", "label", "step"], sort=False)["number"].mean()
     panels, labels = (list(dict.fromkeys(curves.index.get_level_values(name))) for name in ("panel", "label"))
     returns = [name for name in panels if name.startswith("return, ")]
-    limits = return_limits(float(value) for name in returns for value in curves[name])
+    limits = axis_limits(float(value) for name in returns for value in curves[name])
     figure, grid = panel_grid(
         [name if name in returns else name.replace("_", " ") for name in panels],
         min(4 if len(panels) > 9 else 3, len(panels)),
@@ -46,7 +46,7 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
         if name in returns:
             axes.set_ylim(*limits)
     figure.suptitle(title, fontsize=10)
-    legend_below(figure)
+    add_legend_below(figure)
     save_figure(figure, path)
 
 

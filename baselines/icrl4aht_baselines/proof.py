@@ -74,7 +74,7 @@ _TRAINING: dict[str, Any] = {"learning_rate": 2e-3, "validate_every": 10**6, "sa
 
 
 def proof_tasks() -> dict[str, tuple[Task, ...]]:
-    """Return name of a track -> validation tasks: all tasks of `preference`, and tasks with headroom of `teammate`."""
+    """Return name of a track -> its validation tasks; on the track `teammate`, only tasks with headroom."""
     played = [*bundled_tasks(TEAMMATE_TRACK, "validation"), *bundled_tasks(TEAMMATE_TRACK, "diverse")]
     return {
         PREFERENCE: tuple(bundled_tasks(PREFERENCE, "validation")),
@@ -153,7 +153,7 @@ class ProofJob(TrainingJob):
         return f"first episode {returns[PREFERENCE]['1']:.1f}, episodes 6 to 20 {returns[PREFERENCE]['6-20']:.1f}"
 
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
-        """Train the model, and return the `minutes` of training and the `returns` of `play_sets`."""
+        """Train and evaluate the model. Return the `minutes` of training, and the `returns` from `evaluate_on_sets`."""
         learner, run = LEARNERS[self.learner], self.run_folder
         source = () if self.source == "all" else (self.source,)
         histories = HistoryOptions(
@@ -162,7 +162,7 @@ class ProofJob(TrainingJob):
         prepare(learner.method, _MODEL, self.training, histories).train(run, done=self.step_progress(on_update))
         return {
             "minutes": round(_training_seconds(run / TIMING) / 60, 1),
-            "returns": play_sets(find_agent(run, greedy=False), self.options, self.folder / "results"),
+            "returns": evaluate_on_sets(find_agent(run, greedy=False), self.options, self.folder / "results"),
         }
 
 
@@ -173,7 +173,9 @@ def _training_seconds(timing: Path) -> float:
     return float(np.sum(steps / [line["steps_per_second"] for line in lines]))
 
 
-def play_sets(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = True) -> dict[str, dict[str, float]]:
+def evaluate_on_sets(
+    agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = True
+) -> dict[str, dict[str, float]]:
     """Evaluate an agent on each set of validation tasks.
 
     Args:
@@ -201,7 +203,7 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
 
     Args:
         jobs: training jobs; unfinished jobs are skipped.
-        references: name of an ego -> returns from `play_sets`.
+        references: name of an ego -> returns from `evaluate_on_sets`.
         path: path of the file, which is replaced.
     """
     stay, expert = (references[name][TEAMMATE_TRACK]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
@@ -234,6 +236,8 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
 
 
 def run_references(options: ProofOptions, out: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Return the returns from `play_sets` of each ego in `COMPARED_EGOS`, by name; stored results are reused."""
+    """Return the returns from `evaluate_on_sets` of each ego in `COMPARED_EGOS`, by name; stored results are reused."""
     names = dict.fromkeys(name for of_set in COMPARED_EGOS.values() for name in of_set)
-    return {name: play_sets(find_agent(name), options, out / "references" / name, controls=False) for name in names}
+    return {
+        name: evaluate_on_sets(find_agent(name), options, out / "references" / name, controls=False) for name in names
+    }

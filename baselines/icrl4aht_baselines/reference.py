@@ -33,7 +33,7 @@ from icrl4aht_baselines.online.agent_histories import collect_release, release_t
 from icrl4aht_baselines.online.prepare import prepare_play
 from icrl4aht_baselines.report.page import instances_range, markdown_sections
 from icrl4aht_baselines.report.results import EvaluationRun, ResultSource, evaluate_agent, merge, read_run
-from icrl4aht_baselines.training.histories import prepare, start_from
+from icrl4aht_baselines.training.histories import load_initial_params, prepare
 from icrl4aht_baselines.training.job import TrainingJob
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
@@ -198,7 +198,7 @@ class ReferenceJob(TrainingJob):
 
     @property
     def recipe(self) -> Recipe:
-        """How the model is made."""
+        """Settings that the model is made with."""
         return RECIPES[self.model]
 
     @property
@@ -208,7 +208,7 @@ class ReferenceJob(TrainingJob):
 
     @property
     def updates(self) -> int:
-        """Number of training steps, of both training runs if there are two."""
+        """Number of training steps, summed over both training runs if there are two."""
         return self.training.steps * (1 + self.recipe.own_round)
 
     @property
@@ -243,7 +243,7 @@ class ReferenceJob(TrainingJob):
         return {}
 
     def generated_release(self, profile: str) -> Path:
-        """Generate the release of a profile. Return the folder of the release."""
+        """Generate the release of a profile, unless it exists. Return the folder of the release."""
         folder = self.out / profile
         with process_lock(self.out / f".{profile}.generating.lock"):
             if not (folder / "lite").is_dir():
@@ -273,11 +273,13 @@ class ReferenceJob(TrainingJob):
         choice = HistoryOptions(layouts, root, **TRACK_VIEWS[self.track])
         model, play = ModelOptions(**recipe.model), PlayOptions(**TRACK_PLAY[self.track], **recipe.play)
         job = prepare_play(recipe.method, model, self.training, play, choice, self.diverse_tasks())
-        params = start_from(MODELS / recipe.start / "teammate", job.method, job.about) if recipe.start else None
+        params = (
+            load_initial_params(MODELS / recipe.start / "teammate", job.method, job.about) if recipe.start else None
+        )
         job.train(self.run_folder, params=params, done=self.step_progress(on_update))
 
     def trained_teacher(self) -> str | Path:
-        """Return the teacher; without a given teacher, train RL^2 first."""
+        """Return the name or run folder of the teacher. If no teacher was given, train RL^2 first."""
         if self.teacher:
             return self.teacher
         job = ReferenceJob("rl2-reference", self.track, 0, self.out, xla_threads=self.xla_threads)
@@ -302,7 +304,7 @@ class ReferenceJob(TrainingJob):
         views = {**self.recipe.histories, **TRACK_VIEWS[self.track]}
         histories = HistoryOptions(TRACKS[self.track]["train"], str(root), channels="canonical", **views)
         job = prepare(self.recipe.method, ModelOptions(**self.recipe.model), options, histories)
-        params = start_from(before, job.method, job.about) if before else None
+        params = load_initial_params(before, job.method, job.about) if before else None
         job.train(folder, params=params, done=self.step_progress(on_update, options.steps if before else 0))
 
     def add_own_histories(self, histories: Path, first: Path) -> Path:
@@ -322,7 +324,7 @@ class ReferenceJob(TrainingJob):
         return [task for track in tracks for task in bundled_tasks(track, split)]
 
     def results(self, kind: str) -> Path:
-        """Return the folder of the results with a name in `EVALUATIONS`."""
+        """Return the folder of the job's results; `kind` is a name in `EVALUATIONS`."""
         return self.folder / "results" / kind
 
     def evaluate(self, show: Callable[..., None]) -> None:

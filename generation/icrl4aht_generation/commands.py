@@ -326,8 +326,8 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
     """Sample heuristic teammates for tasks, and measure them.
 
     Samples parameters from the training ranges and from wider ranges (diverse): for each layout and family 32 teammates
-    for training and 8 for validation. Writes for each teammate the test teammate with the most similar behaviour, and
-    the returns of the egos stay, random and oracle with the new teammate. With --spread, chooses widely different
+    for training and 8 for validation. For each of them, writes the test teammate with the most similar behaviour, and
+    the returns of the egos stay, random and oracle with the sampled teammate. With --spread, chooses widely different
     teammates for tasks.spread of the profiles. A stopped command resumes: layouts that the table already contains are
     skipped.
     """
@@ -395,8 +395,8 @@ def teammates(
 def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
     """Report how much the teammates of a suite differ.
 
-    Prints self-play and cross-play returns of each population, and mean Hamming distances between the teammates of
-    algorithms and heuristics. Writes nothing.
+    Prints self-play and cross-play returns of each population, and mean Hamming distances (share of states in which two
+    teammates act differently) between algorithms and families of heuristics. Writes nothing.
     """
     from icrl4aht_generation.populations.build import report_diversity
 

@@ -20,7 +20,7 @@ from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe, observe_both
-from icrl4aht_data.overcooked.state import start_record
+from icrl4aht_data.overcooked.state import initial_record
 from icrl4aht_data.overcooked.tables import Tables, stack_tables
 from icrl4aht_generation.policy import Policy, Situation
 
@@ -86,7 +86,7 @@ class Environment:
 
     @cached_property
     def tables(self) -> Tables:
-        """Tables of the environment's layout, or stacked tables of its several layouts."""
+        """Tables of the environment's layout, or stacked tables of all its layouts."""
         if isinstance(self.layout, Tables):
             return self.layout
         if not isinstance(self.layout, Layout):
@@ -157,7 +157,7 @@ class Environment:
         return jax.vmap(lambda number, *own: function(self.tables_of(number), *own))(layout, *arguments)
 
     def tables_of(self, layout: Int[Array, ""] | None) -> Tables:
-        """Return the tables of a layout by its number, which may be None if there is only one layout."""
+        """Return the tables of the layout with a given number; the number may be None if there is only one layout."""
         # The compiler fuses this gather with later gathers, so no environment has its own copy of the tables.
         return self.tables if layout is None else jax.tree.map(lambda leaf: jnp.asarray(leaf)[layout], self.tables)
 
@@ -257,7 +257,7 @@ def _first_record(tables: Tables, draw: Key[Array, "*N 5"]) -> UInt8[Array, "*N 
     mate_number += one_room & (mate_number >= ego_number)
     positions = jnp.stack([ego_room[ego_number], mate_room[mate_number]], axis=-1)
     facings = jnp.stack([_random_below(draw[..., k], np.uint32(4)) for k in (2, 3)], axis=-1).astype(jnp.uint8)
-    return start_record(tables, positions, facings, _random_recipe(tables, draw[..., 4]))
+    return initial_record(tables, positions, facings, _random_recipe(tables, draw[..., 4]))
 
 
 def _random_recipe(tables: Tables, keys: Key[Array, "*N"]) -> UInt8[Array, "*N"]:

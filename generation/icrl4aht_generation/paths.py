@@ -1,8 +1,8 @@
 """Features of a state for scripted agents: masks over cells, shortest paths, and moves along these paths.
 
 `cells` denotes the cells of the layout, row by row. Scripted agents see the complete state. Paths ignore the partner.
-Ties are resolved in the order right, down, left, up (first steps) and above, below, left, right (access cells), and row
-by row for targets. Source: paper, App. B.2.
+Ties between first steps are resolved in the order right, down, left, up, ties between access cells in the order above,
+below, left, right, and ties between targets row by row. Source: paper, App. B.2.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Rule(NamedTuple):
 
 
 class ChosenRule(NamedTuple):
-    """The first rule in a list that applies. If no rule applies, only `found` is defined.
+    """The first rule of a list that applies. If no rule applies, only `found` is meaningful.
 
     Attributes:
         found: bool scalar, whether a rule applies.
@@ -85,7 +85,9 @@ class ChosenRule(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Features of a state from one agent's view; each is computed at first use, and all masks are bool (cells,).
+    """Features of a state from one agent's view; a feature is computed when it is first used.
+
+    All masks are bool arrays of shape (cells,).
 
     Attributes:
         tables: tables of the layout.
@@ -104,17 +106,17 @@ class Scene:
 
     @cached_property
     def cells(self) -> Int[Array, " cells"]:
-        """Numbers of all cells."""
+        """Cell numbers of all cells of the layout."""
         return jnp.arange(self.tables.kinds.shape[0])
 
     @cached_property
     def own_cell(self) -> Int[Array, ""]:
-        """Number of the agent's cell."""
+        """Cell number of the agent's position."""
         return self.state.positions[self.slot].astype(jnp.int32)
 
     @cached_property
     def partner_cell(self) -> Int[Array, ""]:
-        """Number of the partner's cell."""
+        """Cell number of the partner's position."""
         return self.state.positions[1 - self.slot].astype(jnp.int32)
 
     # Properties for the items in both agents' hands
@@ -157,7 +159,7 @@ class Scene:
 
     def values_on_cells(self, kind: int, values: Array) -> Array:
         """Return a value for each cell: the value of the pot, button or counter on the cell, or 0."""
-        # A gather is used, because a scatter by traced values is slow under vmap.
+        # A gather is used, because a scatter of traced values is slow under vmap.
         number = jnp.asarray(self.tables.number)
         if not values.shape[0]:
             return jnp.zeros(number.shape, values.dtype)
@@ -220,7 +222,7 @@ class Scene:
 
     @staticmethod
     def ingredient_counts(item: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
-        """Return how many pieces of each of the layout's ingredients an item has, by ascending id; padded with 0."""
+        """Return three counts for the pieces in an item: one per ingredient of the layout by ascending id, then 0."""
         # An item byte has two bits for each ingredient, above the bits of plate and cooked.
         shift = 2 + 2 * jnp.arange(3, dtype=jnp.uint8)
         return (item[..., None] >> shift & 3).astype(jnp.int32)
@@ -292,11 +294,11 @@ class Scene:
         return jnp.asarray(self.tables.first_step)[self.own_cell, cell].astype(jnp.int32)
 
     def reachable(self, mask: Bool[Array, " cells"]) -> Bool[Array, " cells"]:
-        """Return the mask's cells that are next to a floor cell that the agent can reach."""
+        """Restrict a mask to cells next to a floor cell that the agent can reach."""
         return mask & (self._target_distance < UNREACHABLE)
 
     def nearest_distance(self, mask: Bool[Array, " cells"]) -> Int[Array, ""]:
-        """Return the distance to the nearest access cell of the mask's cells; UNREACHABLE without a path."""
+        """Return the distance to the nearest access cell of any cell in the mask; UNREACHABLE without a path."""
         return jnp.min(jnp.where(mask, self._target_distance, UNREACHABLE))
 
     def nearest_cell(self, mask: Bool[Array, " cells"]) -> Int[Array, ""]:
@@ -317,7 +319,7 @@ class Scene:
     ) -> tuple[Int[Array, ""], Int[Array, ""] | Float[Array, ""]]:
         """Return the step towards the cheapest access cell of a target, and the cell's cost.
 
-        The cost is the distance, plus 100 if the partner is on the cell, plus `extra` (cells,).
+        The cost is the distance, plus 100 if the partner is on the cell, plus the cell's value in `extra`.
         """
         access = self.access_cells(target)
         # No path is as long as 100, so an occupied access cell is only chosen if no other can be reached.
@@ -347,7 +349,7 @@ class Scene:
 
     @cached_property
     def move_cells(self) -> Int[Array, " 4"]:
-        """Cells to which a move right, down, left or up leads; the agent's cell if the move is blocked."""
+        """Cells to which a move right, down, left or up leads; the agent's cell if the map blocks the move."""
         return jnp.asarray(self.tables.moves)[self.own_cell, jnp.array(SEARCH_ORDER)].astype(jnp.int32)
 
     @cached_property

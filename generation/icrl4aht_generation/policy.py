@@ -76,7 +76,7 @@ def on_layout(policy: Policy, layout: Layout) -> Policy:
     return policy._replace(act=_act_on_layout(policy.act, layout), sees="state")
 
 
-def sometimes_random(key: Key[Array, ""], chance: Any, action: Int[Array, ""]) -> Int[Array, ""]:
+def randomize_action(key: Key[Array, ""], chance: Any, action: Int[Array, ""]) -> Int[Array, ""]:
     """Return the given action, or with probability `chance` one of the six actions at random."""
     whether, which = jax.random.split(key)
     drawn = jax.random.randint(which, (), 0, len(ACTIONS))

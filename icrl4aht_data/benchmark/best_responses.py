@@ -19,7 +19,7 @@ from icrl4aht_data.utils.install_hints import RESTORE
 from icrl4aht_data.utils.templates import card_file
 
 
-class TrainedResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class TrainingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One training run of an ego with one teammate.
 
     Attributes:
@@ -60,7 +60,7 @@ class BestResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     family: str
     split: str
     tasks: tuple[str, ...]
-    seeds: tuple[TrainedResponse, ...]
+    seeds: tuple[TrainingRun, ...]
     best: float
     agent: str
 
@@ -81,7 +81,7 @@ class BestResponseCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     behaviours: tuple[BestResponse, ...] = ()
 
 
-def chosen_training(trainings: Iterable[TrainedResponse]) -> TrainedResponse:
+def best_training_run(trainings: Iterable[TrainingRun]) -> TrainingRun:
     """Return the training run with the highest `choice`, the mean return in the episodes that decide between runs."""
     return max(trainings, key=lambda one: -math.inf if one.choice is None else one.choice)
 
@@ -106,7 +106,7 @@ def read_best_responses(path: Path | None = None) -> BestResponseCard:
         raise OptionError(f"{path}: invalid file of best responses: {error}; restore it: `{RESTORE}`") from error
     counts = Counter(task for behaviour in card.behaviours for task in behaviour.tasks)
     if twice := sorted(task for task, number in counts.items() if number > 1):
-        raise OptionError(f"{path}: expected one best response to task {twice[0]}, found two; remove one of them")
+        raise OptionError(f"{path}: expected one best response for task {twice[0]}, found two; remove one of them")
     return card
 
 

@@ -78,7 +78,7 @@ LAYOUT_NAMES = tuple(dict.fromkeys(name for splits in TRACKS.values() for names 
 FOUR_RECIPES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
 """Recipes used for the published results on the layout track; the layouts themselves have the first and the last."""
 
-_OTHER_NUMBERS = 10_000  # how many values `layout_number` can take for registered layouts
+_OTHER_NUMBERS = 10_000  # number of possible values of `layout_number` for registered layouts
 
 FAMILIES = ("rl", "H1", "H2", "H3", "H4")
 """Families of teammates: "rl" (learned policies) and the heuristics "H1".."H4" (paper, App. B)."""
@@ -145,7 +145,7 @@ def all_families() -> tuple[str, ...]:
     return (*FAMILIES, *TEAMMATE_PLUGINS.names)
 
 
-def family_order(family: str) -> tuple[int, str]:
+def family_sort_key(family: str) -> tuple[int, str]:
     """Return the sort key of a family: the benchmark's families come first, then other families by name."""
     return (FAMILIES.index(family), "") if family in FAMILIES else (len(FAMILIES), family)
 
@@ -162,11 +162,11 @@ def track_layouts(track: str, split: str) -> tuple[str, ...]:
     return (*TRACKS[track][split], *(added_layout_names() if track == "layout" else ()))
 
 
-def track_of(layout: str) -> str:
+def layout_track(layout: str) -> str:
     """Return the benchmark's track whose layouts include `layout` (short name).
 
-    A published layout whose indicators are removed keeps its track; the track of generated and registered layouts is
-    "layout".
+    A published layout without its indicators and buttons (suffix `PLAIN`) keeps its track; the track of generated and
+    registered layouts is "layout", also if they belong to the track `PREFERENCE`.
 
     Raises:
         UnknownNameError: if no track includes the layout.
@@ -180,13 +180,13 @@ def track_of(layout: str) -> str:
     raise unknown_name("layout", layout, (*LAYOUT_NAMES, *added_layout_names()))
 
 
-def layout_order(layout: str) -> tuple[int, str]:
+def layout_sort_key(layout: str) -> tuple[int, str]:
     """Return the sort key of a layout (short name): the benchmark's layouts come first, then others by name."""
     return (LAYOUT_NAMES.index(layout), "") if layout in LAYOUT_NAMES else (len(LAYOUT_NAMES), layout)
 
 
 def layout_number(layout: str) -> int:
-    """Return the number of a layout (short name) that seeds depend on: the position of the layout in `LAYOUT_NAMES`.
+    """Return the number that stands for a layout (short name) in seeds: the layout's position in `LAYOUT_NAMES`.
 
     A registered layout's number is a hash of its name, so the number does not depend on the installed packages.
     """
@@ -206,7 +206,7 @@ def check_family(family: object) -> None:
         raise unknown_name("teammate_family", family, families)
 
 
-def check_membership(track: Any, split: Any, layout: Any) -> None:
+def check_layout_in_split(track: Any, split: Any, layout: Any) -> None:
     """Check that a layout (short name) belongs to a split of a track.
 
     Raises:

@@ -14,13 +14,13 @@ REFERENCES = ("stay", "random", "oracle")
 HEURISTICS = FAMILIES[1:]
 """The teammate families of the test tasks."""
 
-_NO_HEADROOM = 1.0  # a cell has headroom if the return of `oracle` exceeds the return of `stay` by more than 1
+_NO_HEADROOM = 1.0  # a pair (layout, family) has headroom if `oracle` earns more than `stay` plus this return
 
 Cell = tuple[str, str]
 """Pair of a layout's short name and a teammate family."""
 
 
-def read_headroom(protocol: str) -> dict[Cell, dict[str, float]]:
+def read_reference_returns(protocol: str) -> dict[Cell, dict[str, float]]:
     """Return the reference egos' mean returns by (layout, family); empty for a protocol without measurements."""
     content = json.loads(card_file("headroom.json").read_text(encoding="utf-8")).get(protocol, {})
     return {(layout, family): agents for layout, families in content.items() for family, agents in families.items()}
@@ -48,9 +48,10 @@ def cells_without_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: S
 
 
 def headroom_table(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str]) -> str:
-    """Return a Markdown table of mean returns of `stay`, `random` and `oracle`, and a line of cells without headroom.
+    """Return a Markdown table of the mean returns of `stay`, `random` and `oracle` for each family and layout.
 
-    The table has one row per family and one column per layout; cells with headroom are bold.
+    The table has one row per family and one column per layout; cells with headroom are bold. A line below the table
+    lists the cells without headroom.
     """
     rows = [[family, *(_cell_text(cells.get((layout, family))) for layout in layouts)] for family in HEURISTICS]
     flat = ["/".join(cell) for cell in cells_without_headroom(cells, layouts)]

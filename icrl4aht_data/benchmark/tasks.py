@@ -26,7 +26,7 @@ from icrl4aht_data.benchmark.facts import (
     SPLITS,
     TEAMMATE_PLUGINS,
     check_family,
-    check_membership,
+    check_layout_in_split,
     kind_family,
 )
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, check_choice, unknown_name
@@ -73,7 +73,7 @@ class Task:
 
     @property
     def teammate_key(self) -> tuple[str, str]:
-        """Key that is equal for tasks with the same teammate, layout and recipes: the layout's name and a hash."""
+        """Layout name and hash; tasks with the same teammate, layout and recipes have equal keys."""
         return self.layout.name, json_hash(self.teammate if self.recipes is None else [self.teammate, self.recipes])
 
     @property
@@ -89,7 +89,7 @@ class Task:
 
 @dataclass(frozen=True)
 class NamedTask(Task):
-    """A task known only from the index of a release: its teammate's parameters are unknown, its seed is -1.
+    """A task known only from the index of a release, with unknown parameters of the teammate and seed -1.
 
     Args:
         teammate: the fields teammate_kind and teammate_family of the index line.
@@ -111,7 +111,7 @@ def named_task(line: Mapping[str, Any]) -> NamedTask:
         UnknownNameError: for names that the benchmark does not know.
     """
     layout = get_layout(line["layout"])
-    check_membership(line["track"], line["split"], layout.name)
+    check_layout_in_split(line["track"], line["split"], layout.name)
     check_family(line["teammate_family"])
     teammate = {name: line[name] for name in ("teammate_kind", "teammate_family")}
     return NamedTask(line["task_id"], line["track"], line["split"], layout.alias, -1, teammate)
@@ -145,7 +145,7 @@ def make_task(
         TaskFormatError: if a recipe occurs twice, or needs an ingredient that the layout does not have.
     """
     known = get_layout(layout)
-    check_membership(track, split, known.name)
+    check_layout_in_split(track, split, known.name)
     task = Task("", track, split, known.alias, seed, teammate, None if recipes is None else tuple(recipes))
     task = replace(task, task_id=task_id(task))
     _check_recipes(task)
@@ -172,8 +172,9 @@ def manifest_path(track: str, split: str, teammates: Literal["", "diverse"] = ""
 
     Args:
         track: name of the track, such as "teammate".
-        split: "test" or "validation", or "train" for diverse teammates.
-        teammates: "diverse" for training tasks whose teammates' parameters vary more than the published ranges.
+        split: "test" or "validation", or "train" for diverse teammates and the track "preference".
+        teammates: "diverse" for training or validation tasks with teammates that vary in all parameters that decide a
+            teammate's behaviour.
 
     Raises:
         UnknownNameError: for an unknown track or split.
@@ -249,7 +250,7 @@ def parse_task(fields: Any) -> Task:
     """
     task = Task(**msgspec.structs.asdict(_convert(fields, _TaskFields, "")))
     _check_recipes(task)
-    check_membership(task.track, task.split, task.layout.name)
+    check_layout_in_split(task.track, task.split, task.layout.name)
     check_teammate(task.teammate)
     if task.task_id != (expected := task_id(task)):
         raise TaskFormatError(f"task_id {task.task_id!r} does not match the task's content, expected {expected!r}")

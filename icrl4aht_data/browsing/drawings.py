@@ -10,7 +10,7 @@ from icrl4aht_data.overcooked.drawing import FOOTER, PAPER, VIEW, Canvas, Colour
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 
-_DIGITS = 3  # decimals of coordinates, whose unit is one map cell
+_DIGITS = 3  # decimal places of coordinates, which are in map cells
 
 Drawings = dict[str, dict[str, list]]
 """Name of a drawn part -> its state values, joined by commas -> shapes; see `layout_drawings`."""
@@ -30,7 +30,7 @@ def _round_coordinate(value: float) -> float:
 
 
 def _distinct_rows(rows: np.ndarray) -> list[list[int]]:
-    """Return the distinct rows of a uint8 array (N, K); for few columns this is much faster than `np.unique`."""
+    """Return the distinct rows of a uint8 array of shape (N, K); for small K, much faster than `np.unique`."""
     if len(rows) == 1:
         return rows.tolist()
     found = np.zeros((256,) * rows.shape[1], bool)
@@ -48,7 +48,7 @@ def add_drawings(layout: Layout, records: np.ndarray, known: Drawings) -> Drawin
 
     Args:
         layout: the layout.
-        records: state records uint8 (N, S).
+        records: state records, uint8 of shape (N, S).
         known: drawings made so far; extended in place.
     """
     new: Drawings = {}
@@ -68,7 +68,7 @@ def layout_drawings(layout: Layout, records: np.ndarray) -> dict[str, Any]:
 
     Args:
         layout: the layout.
-        records: state records uint8 (N, S).
+        records: state records, uint8 of shape (N, S).
 
     Returns:
         width, height: size of the map in cells; footer: height of the strip below the map; paper: background colour.

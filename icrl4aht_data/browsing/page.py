@@ -65,10 +65,11 @@ class EmbeddedHistory(NamedTuple):
     data: bytes
 
 
-def spread_histories(dataset: Dataset, count: int) -> list[int]:
-    """Return at most `count` history ids in ascending order, taken in turn from layouts, sources and teammate kinds.
+def varied_history_ids(dataset: Dataset, count: int) -> list[int]:
+    """Return at most `count` history ids, ascending, spread over layouts, sources and teammate kinds.
 
-    The generated layouts of a family count as one layout.
+    Layouts take turns, and within a layout its sources and teammate kinds. The generated layouts of a family count as
+    one layout.
     """
     groups: dict[str, dict[str, dict[tuple[str, ...], list[int]]]] = {}
     names = ("layout", "source", "teammate_family", "teammate_kind")
@@ -85,7 +86,7 @@ def _interleave(lists: Iterable[list[int]]) -> list[int]:
     return [number for turn in zip_longest(*lists) for number in turn if number is not None]
 
 
-def spread_episodes(episodes: int, most: int | None) -> np.ndarray:
+def evenly_spaced_episodes(episodes: int, most: int | None) -> np.ndarray:
     """Return the numbers of at most `most` evenly spaced episodes of a history, including the first and the last."""
     if most is None or most >= episodes:
         return np.arange(episodes)
@@ -102,8 +103,8 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
     entry, rewards, dones = history.entry, history.read("rewards"), history.read("dones")
     ends = np.flatnonzero(dones) + 1
     _require(history, len(ends) == entry.episodes, f"{entry.episodes} episodes", f"{len(ends)} ends of episodes")
-    starts, shown = np.concatenate([[0], ends[:-1]]), spread_episodes(len(ends), most)
-    # An episode has one frame more than steps: the state after its last step.
+    starts, shown = np.concatenate([[0], ends[:-1]]), evenly_spaced_episodes(len(ends), most)
+    # An episode with n steps has n + 1 frames: the last frame shows the state after the last step.
     steps = np.concatenate([np.arange(int(starts[e]), int(ends[e]) + 1) for e in shown])
     last = np.cumsum(ends[shown] + 1 - starts[shown]) - 1
     steps[last] -= 1
@@ -116,7 +117,7 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
     values["rewards"][last] = 0
     for name in (name for name in ACTION_FIELDS if entry.has(FIELDS[name])):
         if name == "oracle_actions" and entry.source == "noise" and "expert_actions" in values:
-            continue  # histories made with action noise have the same oracle and expert actions
+            continue  # in histories with action noise, the expert actions are the oracle actions
         values[name] = history.read(name)[steps].astype(np.uint8)
         _require(history, int(values[name].max()) < len(ACTIONS), f"{name} below {len(ACTIONS)}", values[name].max())
         values[name][last] = NO_ACTION
@@ -164,7 +165,7 @@ def make_browser_page(
     megabytes: float = PAGE_MEGABYTES,
     advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> BrowserPage:
-    """Return an HTML page with all histories of a selection; use `spread_histories` to choose fewer histories.
+    """Return an HTML page with all histories of a selection; use `varied_history_ids` to choose fewer histories.
 
     The page embeds all episodes if it stays below `megabytes`, otherwise evenly spaced episodes of each history,
     including the first and the last. The page says which episodes can be watched.
@@ -211,7 +212,7 @@ def save_browser_page(page: BrowserPage, path: Path) -> None:
 
 def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
     info, origin = dataset.info, dataset.origin
-    name = str(origin) if isinstance(origin, Remote) else dataset.root.resolve().name  # without the path of the folder
+    name = str(origin) if isinstance(origin, Remote) else dataset.root.resolve().name  # omits a folder's parents
     by_layout = grouped(embedded, lambda one: one.facts["layout"])
     index = {
         "release": {"name": name, "kind": info.kind, "version": info.data_version, "histories": info.histories},

@@ -25,7 +25,7 @@ from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_noun
 
 _ROUNDING = 1e-3  # tolerance between the mean returns in `Provenance.filter` and in the index
-_NAMED = 100  # maximum number of missing shards to report for one set of numbered shards
+_NAMED = 100  # maximum number of missing shards to report for each shard in the index
 _OF_A_TASK = (
     *("track", "split", "layout", "teammate_family", "teammate_kind", "seed", "source"),
     *("expert_return", "expert_return_sampled", "expert_step", "label_view"),
@@ -94,7 +94,7 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
 
 
 def _check_disjoint_teammates(tasks: Iterable[Task], report: Report) -> None:
-    """Check that training and test tasks of a track have no common teammates."""
+    """Check that no test or held-out task has the teammate of a training task on the same track and layout."""
     seen: dict[tuple[str, str, str], str] = {}
     for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # training tasks come before test tasks
         key = (task.track, task.layout.name, json.dumps(task.teammate, sort_keys=True))
@@ -149,7 +149,7 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
 
 
 def _contradictions(made: Provenance, entries: Sequence[Entry], seed: int | None) -> Iterator[str]:
-    """Yield each contradiction in a task's provenance, or between the provenance and the index or the task's seed."""
+    """Yield each contradiction within a task's provenance, or with the index entries or the task's seed."""
     first, count = entries[0], len(entries)
     if first.source in SCRIPTED_SOURCES and made.expert and made.expert.policy_sha256:
         labeller = made.expert.policy_sha256
@@ -162,7 +162,7 @@ def _contradictions(made: Provenance, entries: Sequence[Entry], seed: int | None
     episodes = noise.get("episodes")
     stream, learner = (max(entries, key=attrgetter(name)) for name in ("env_idx", "learner"))
     other = next((entry for entry in entries if entry.episodes != episodes), first)
-    # Checks are (name, value, relation, bound, text of the bound). Checks with an unknown number (None) are skipped.
+    # Checks are (name, value, relation, bound, text of the bound). Checks with value or bound None are skipped.
     checks: list[tuple[str, Any, Callable[[Any, Any], bool], Any, str]] = [
         ("seed", made.seed, eq, seed, "the task's {}"),
         ("ego_hash", made.ego_hash, eq, made.ego and json_hash(made.ego), "{} of `ego`"),

@@ -16,7 +16,7 @@ NamedProgress = Callable[[str, int, int], None]
 """Callback that receives the name of a stage, the number of items done, and their total."""
 
 _FINDINGS = 100_000  # maximum number of findings in a report
-_SHOWN = 5  # number of findings in a repr
+_SHOWN = 5  # number of findings in the `repr` of a report
 _LONG = 2000  # maximum characters of a finding
 
 
@@ -80,7 +80,7 @@ class Report:
         return {"ok": self.ok, **asdict(self), "deep": self.level == "deep", "quick": self.level == "quick"}
 
     def add(self, file: str, problem: str) -> None:
-        """Add a finding; after 100,000 findings, add a note that problems were omitted, and drop further findings."""
+        """Add a finding; after 100,000 findings, add one that says that problems were omitted, and drop the rest."""
         if len(self.findings) < _FINDINGS:
             self.findings.append(Finding(_printable(file), _printable(problem)))
         elif len(self.findings) == _FINDINGS:

@@ -20,13 +20,13 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.rules import step
-from icrl4aht_data.overcooked.state import columns, faults, start_record
+from icrl4aht_data.overcooked.state import columns, faults, initial_record
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.system import free_memory
-from icrl4aht_data.writing.published_views import empty_views
+from icrl4aht_data.writing.published_views import views_without_items
 
-_COPIES = 4  # memory that checking a history takes, as a multiple of the size of its arrays
+_COPIES = 4  # memory needed to check a history, as a multiple of the size of the history's arrays
 
 
 def check_chunks(shard: Shard, report: Report) -> set[int]:
@@ -106,9 +106,9 @@ def _history_faults(history: History, layout: Layout, kept_steps: int, deep: boo
 
 
 def observation_faults(layout: Layout, history: History) -> Iterator[str]:
-    """Yield a problem if an observation contradicts the fixed cells of the layout; no state records are needed."""
+    """Yield a problem if observations contradict the fixed cells of the layout, without using state records."""
     fixed = fixed_channels(layout)
-    views = {view.tobytes() for view in empty_views(layout)[..., fixed]}
+    views = {view.tobytes() for view in views_without_items(layout)[..., fixed]}
     wrong = [t for t, seen in enumerate(history.read("obs")[..., fixed]) if seen.tobytes() not in views]
     if wrong:
         yield f"obs: {len(wrong)} steps do not show {layout.name} from any cell of the ego's, first step {wrong[0]}"
@@ -120,8 +120,8 @@ def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: 
     Args:
         layout: the history's layout.
         history: the history; all of its states must be possible.
-        dones: bool (T,), True at the last step of each episode.
-        rewards: (T,), the recorded rewards.
+        dones: bool of shape (T,), True at the last step of each episode.
+        rewards: the recorded rewards, of shape (T,).
     """
     states, ends = history.read("state"), history.read("episode_end_state")
     if history.kind == "full":
@@ -145,7 +145,7 @@ def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: 
         yield "a recipe is not one of the layout's"
     starts = states[np.concatenate([[0], np.flatnonzero(dones)[:-1] + 1])]
     positions = starts[:, columns(layout).positions]
-    fresh = start_record(layout, positions, starts[:, columns(layout).facings], starts[:, recipe])
+    fresh = initial_record(layout, positions, starts[:, columns(layout).facings], starts[:, recipe])
     differs = (fresh != starts).any(axis=-1)
     for agent in (0, 1):
         differs |= ~np.isin(positions[:, agent], layout.rooms[agent])
@@ -163,7 +163,7 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
     ordered = np.sort(shard.table, order="offset")
     stops, starts = (ordered["offset"] + ordered["size"]).tolist(), ordered["offset"].tolist()
     size = shard.path.stat().st_size
-    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // METADATA_ROW_BYTES  # the writer never makes more rows
+    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // METADATA_ROW_BYTES  # the writer makes no more rows
     faults, between = [], np.flatnonzero(shard.table["rows"] == 0).tolist()
     if len(ordered) > most or [0, *stops] != [*starts, size]:
         faults, between = [f"the chunk table does not cover the file's {size} bytes, each once"], []

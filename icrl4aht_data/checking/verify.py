@@ -100,7 +100,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         chosen = chosen_files(origin, **wanted)
     except (EmptySelectionError, UnknownNameError):
         raise
-    except Icrl4ahtError as error:  # reported after damaged files, which may be the cause
+    except Icrl4ahtError as error:  # reported after the damaged files, which may have caused this error
         unreadable = error
     if report.level != "quick":
         origin.fetch(sorted(chosen))
@@ -149,7 +149,7 @@ def _check_shards(
     index: Index, layouts: Mapping[str, Layout], shards: list[str], report: Report, advance: NamedProgress
 ) -> None:
     """Check shards and their histories; `layouts` maps task ids to layouts with the tasks' recipes."""
-    local = ReleaseLocation(index.root)  # downloads nothing: missing files are already reported
+    local = ReleaseLocation(index.root)  # a local location downloads nothing; missing files are already reported
     members = grouped(index.entries, lambda entry: entry.shard)
     total = sum(len(members[name]) for name in shards)
     for name in shards:

@@ -19,7 +19,7 @@ import click
 from icrl4aht_data.commands.verbs import SECTIONS, VERB_GROUP, VERBS, Verb
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown_name
 from icrl4aht_data.utils.files import FULL, describe_disk, final_name
-from icrl4aht_data.utils.install_hints import missing_library
+from icrl4aht_data.utils.install_hints import missing_library_message
 from icrl4aht_data.utils.plugins import Plugins
 
 _REMEDIES = {
@@ -137,7 +137,7 @@ def run(command: click.Command) -> None:
     If the reader of a pipe exits (`| head`), the command stops quietly with exit code 1. Output to a stream that is
     closed from the start (`>&-`) is dropped.
     """
-    for name in ("stdout", "stderr"):  # else a file opened later gets the descriptor 1 or 2
+    for name in ("stdout", "stderr"):  # otherwise the next opened file would get descriptor 1 or 2
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     try:
@@ -151,7 +151,7 @@ def run(command: click.Command) -> None:
     except OSError as error:
         _exit_with_error(_os_error_message(error), 1)
     except ModuleNotFoundError as error:
-        if (message := missing_library(error.name or "")) is None:
+        if (message := missing_library_message(error.name or "")) is None:
             raise
         _exit_with_error(message, 1)
     except SystemExit as stop:

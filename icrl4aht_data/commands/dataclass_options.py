@@ -51,7 +51,7 @@ def topic(heading: str, *options: Callable[[Any], Any]) -> Callable[[Command], C
 
 
 class OptionValue(click.ParamType):
-    """Click type of an option, with the type and bounds that an annotation gives.
+    """Click type that checks an option's value against the type and bounds of an annotation.
 
     Args:
         hint: the annotation, such as `Annotated[int, Meta(ge=1)]`.

@@ -58,7 +58,7 @@ def diagnose() -> dict[str, Any]:
 
 
 def report_lines(found: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of a readable report of the result of `diagnose`."""
+    """Yield the result of `diagnose` as lines of readable text."""
     for section in (name for name, facts in found.items() if isinstance(facts, dict)):
         yield section.capitalize()
         yield from (
@@ -98,7 +98,7 @@ def _installed_version(name: str) -> str | None:
 
 
 def _plugins(problems: Problems) -> dict[str, Any]:
-    """Return the names that other packages register, by entry-point group; only layouts are imported."""
+    """Return the names that other packages register, by entry-point group; import only the registered layouts."""
     facts: dict[str, Any] = {}
     for plugins in (LAYOUT_PLUGINS, TEAMMATE_PLUGINS, Plugins(METHOD_GROUP, ())):
         try:

@@ -18,7 +18,7 @@ from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, get_layout
 
 
 class Names(click.ParamType):
-    """Click type of a name from a set that is computed when needed; errors suggest the nearest name.
+    """Click type of a name; the valid names are computed when needed, and errors suggest the nearest name.
 
     Args:
         name: singular noun for the names, such as "layout".
@@ -44,8 +44,8 @@ class Names(click.ParamType):
         return [CompletionItem(name) for name in self.valid() if name.startswith(incomplete)]
 
 
-def checked_later(value: str) -> str:
-    """Accept any name: some names, such as the layouts of a release, can only be checked with other arguments."""
+def accept_any_name(value: str) -> str:
+    """Accept any name, for names that only the command can check, such as the layouts of a given release."""
     return value
 
 
@@ -54,13 +54,13 @@ def _short_layout_names() -> list[str]:
 
 
 LAYOUT = Names("layout", _short_layout_names, get_layout)
-RELEASE_LAYOUT = Names("layout", _short_layout_names, checked_later)
+RELEASE_LAYOUT = Names("layout", _short_layout_names, accept_any_name)
 TRACK, SPLIT = Names("track", lambda: ALL_TRACKS), Names("split", lambda: SPLITS)
 FAMILY = Names("family", all_families)
 
 
 class Folder(click.Path):
-    """Click type of a folder, which need not exist; an empty string, as from an unset shell variable, is an error.
+    """Click type of a folder that need not exist; rejects an empty string, as from an unset shell variable.
 
     Args:
         made_by: the command that makes such folders, for the message; if given, the folder must exist.
@@ -79,7 +79,7 @@ class Folder(click.Path):
         return path
 
 
-class Root(Folder):
+class ReleaseArgument(Folder):
     """Click type of a release: a folder, converted to a path, or an address, which remains a string.
 
     Args:

@@ -19,7 +19,7 @@ from icrl4aht_data.browsing.page import (
     PAGE_START,
     make_browser_page,
     save_browser_page,
-    spread_histories,
+    varied_history_ids,
 )
 from icrl4aht_data.checking.report import verdict_in_words
 from icrl4aht_data.checking.verify import verify_release
@@ -29,7 +29,7 @@ from icrl4aht_data.commands.options import (
     COUNT_OR_NONE,
     Folder,
     NewFile,
-    Root,
+    ReleaseArgument,
     examples,
     filter_options,
     is_terminal,
@@ -65,7 +65,7 @@ from icrl4aht_data.writing.release_folder import HISTORIES_H5
 
 _FORMS = (*ALL_KINDS, "published", "parquet", "minari")
 
-_root = click.argument("root", required=False, type=Root())
+_root = click.argument("root", required=False, type=ReleaseArgument())
 
 
 @click.command("list")
@@ -191,11 +191,11 @@ def browse(
     all episodes fit, the page has some episodes of each history, including the first and the last, and says which. A
     release of observations cannot be shown, since it has no states to draw.
     """
-    with suppress(OSError), out.open("rb") as stream:  # a page that `browse` wrote may be replaced
+    with suppress(OSError), out.open("rb") as stream:  # a page written by `browse` is replaced even without --overwrite
         overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
     check_output(out, overwrite)
     matching = load_icrl4aht(root, **filters)
-    chosen = matching.select(list(dict.fromkeys(wanted)) or spread_histories(matching, histories))
+    chosen = matching.select(list(dict.fromkeys(wanted)) or varied_history_ids(matching, histories))
     with progress_bars(quiet) as show:
         page = make_browser_page(
             chosen, megabytes=megabytes, advance=lambda done, total: show("histories", done, total)
@@ -215,7 +215,9 @@ def browse(
         "icrl4aht-data download https://example.org/icrl4aht --to icrl4aht",
     )
 )
-@click.argument("root", required=False, type=Root(remote=True), envvar="ICRL4AHT_REMOTE", metavar="[ADDRESS]")
+@click.argument(
+    "root", required=False, type=ReleaseArgument(remote=True), envvar="ICRL4AHT_REMOTE", metavar="[ADDRESS]"
+)
 @filter_options
 @click.option("--to", type=Folder(), metavar="FOLDER", help="Write the release here.")
 @click.option("--dry-run", is_flag=True, help="Fetch only the index; print the files to download and their sizes.")
@@ -291,7 +293,7 @@ def verify(
         "icrl4aht-data convert path/to/release --layout demo_wide --to minari --out demo_wide-v0",
     )
 )
-@click.argument("root", required=False, type=Root(), metavar="[SOURCE]")
+@click.argument("root", required=False, type=ReleaseArgument(), metavar="[SOURCE]")
 @click.option(
     "--out",
     "target",
@@ -355,7 +357,7 @@ def convert(
 
 
 @click.command(epilog=examples("icrl4aht-data combine path/to/release path/to/another --data-version 1.0.0 --out both"))
-@click.argument("releases", nargs=-1, required=True, type=Root(), metavar="ROOT...")
+@click.argument("releases", nargs=-1, required=True, type=ReleaseArgument(), metavar="ROOT...")
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the combined release here.")
 @overwrite_option
 @click.option(
@@ -400,7 +402,7 @@ def build(source: Path | None, out: Path, overwrite: bool, quiet: bool, as_json:
 
 @click.command(epilog=examples("icrl4aht-data upload build/release hf://datasets/you/icrl4aht --dry-run"))
 @click.argument("folder", type=Folder())
-@click.argument("address", type=Root(remote=True))
+@click.argument("address", type=ReleaseArgument(remote=True))
 @click.option("--private", is_flag=True, help="Make a new repository private; refuse one that is public.")
 @click.option("--dry-run", is_flag=True, help="Print the plan; change nothing.")
 @quiet_option
@@ -425,9 +427,9 @@ def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool
 def doctor(as_json: bool) -> None:
     """Examine this installation, and report problems.
 
-    Prints versions, optional packages and the extras that install them, devices, the folders in use (their settings,
-    contents and permissions), environment variables, and the state of the bundled release. Writes nothing, and does not
-    use the network. Prints a next step for each problem, and exits with 1 if any is found.
+    Prints versions, optional packages and the extras that install them, names that other packages register, devices,
+    the folders in use and their free space, network settings, and the state of the bundled release. Leaves no files
+    behind, and does not use the network. Prints a next step for each problem, and exits with 1 if any is found.
     """
     found = diagnose()
     print_result(found, "\n".join(report_lines(found)), as_json)

@@ -49,7 +49,7 @@ def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
     """Return a table of the result of `summarize_tasks`, with two lines per task and a last row with totals.
 
-    The table fits 80 columns: names of teammates wrap, ids of tasks are shortened to their end, and long lists of
+    The table fits 80 columns: names of teammates wrap, only the end of a task's id is shown, and long lists of
     history ids are omitted. `list | cat` prints the complete ids.
     """
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), show_footer=True, row_styles=("", "dim"))

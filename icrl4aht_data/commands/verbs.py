@@ -1,4 +1,4 @@
-"""Table of the commands of `icrl4aht-data`, so that `--help` lists all commands without importing any.
+"""Table of the commands of `icrl4aht-data`, which lets `--help` list all commands without importing them.
 
 Another package adds commands by an entry point that names a table, in a module that is fast to import:
 

@@ -42,7 +42,7 @@ def cacheable_bytes() -> int:
 
 
 def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> dict[str, np.ndarray]:
-    """Return the cached arrays of a key, memory-mapped and read-only; build missing arrays first.
+    """Return the cached arrays of a key, memory-mapped and read-only; build the arrays first if they are missing.
 
     The least recently used sets are removed if the cache would exceed its limit or fill the disk. Processes that have
     mapped a removed set can still read the set.
@@ -114,7 +114,7 @@ def _dtype_and_shape(array: np.ndarray) -> list:
 
 
 def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> dict[str, np.ndarray]:
-    """Build a set of arrays in `scratch`, move the set to `folder` unless another process was faster, and return it."""
+    """Build arrays in `scratch`, move them to `folder` unless another process was faster, and return the arrays."""
     new = scratch / "new"
     new.mkdir()
     build(new)

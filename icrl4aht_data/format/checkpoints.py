@@ -1,4 +1,4 @@
-"""Checkpoint paths and files of learned teammates, in a release or a teammate suite, and of a release's expert egos."""
+"""Paths and files of checkpoints: learned teammates in a release or a teammate suite, experts in a release."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ CHECKPOINT_BYTES = 64 * 2**20
 
 
 def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
-    """Return a learned teammate's checkpoint folder, whose name is a hash in a release and a path in a teammate suite.
+    """Return the folder of a learned teammate's checkpoint.
+
+    In a release, the name of the folder is a hash; in a teammate suite (trained populations), it is a path.
 
     Args:
         folder: the folder `TEAMMATES` of a release, or the folder of a suite.

@@ -42,7 +42,7 @@ def chunk_table_name(shard: str) -> str:
 
 
 def read_table(path: Path) -> np.ndarray:
-    """Return a chunk table (rows,) of `CHUNK_DTYPE`, memory-mapped because a table may be large.
+    """Return a chunk table as a memory-mapped array of shape (rows,) and dtype `CHUNK_DTYPE`.
 
     Raises:
         ChunkTableError: if the file is missing or not a chunk table.

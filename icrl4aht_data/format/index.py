@@ -17,7 +17,7 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, LABEL_VIEWS, SOURCES, SPLITS, check_family, check_membership
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, LABEL_VIEWS, SOURCES, SPLITS, check_family, check_layout_in_split
 from icrl4aht_data.errors import (
     EmptySelectionError,
     Icrl4ahtError,
@@ -44,7 +44,7 @@ _BLOCK = 2**12  # number of entries in memory at a time
 _DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int64, float | None: np.float64}
 # The fields `history_id` and `obs_shape` have no columns, since the row and the layout determine their values.
 _NUMBERS = {name: _DTYPES[hint] for name, hint in ENTRY_HINTS.items() if hint in _DTYPES and name != "history_id"}
-_NONE_AS = {int | None: -1, float | None: np.nan}  # numbers that are stored for None; string columns store ""
+_NONE_AS = {int | None: -1, float | None: np.nan}  # numbers stored in place of None; string columns store ""
 _STRINGS = tuple(name for name, hint in ENTRY_HINTS.items() if hint in TEXTS or name in ENCODED)
 _ABSENT = {name: _NONE_AS.get(hint, "") for name, hint in ENTRY_HINTS.items() if type(None) in get_args(hint)}
 _names = attrgetter(*_STRINGS)
@@ -68,7 +68,7 @@ class Columns:
         return len(self._arrays["T"])
 
     def column(self, name: str) -> np.ndarray:
-        """Return a column (H,): values for a number column, codes for a string column."""
+        """Return a column of shape (H,): the values of a number column, or the codes of a string column."""
         return self._arrays[name]
 
     def values(self, name: str) -> list[str]:
@@ -76,7 +76,7 @@ class Columns:
         return self._values[name]
 
     def matches(self, name: str, wanted: Collection[str]) -> np.ndarray:
-        """Return bool (H,), True for histories with any of the wanted values in a string column."""
+        """Return a mask of shape (H,), True for histories with any of the wanted values in a string column."""
         return np.isin(self._arrays[name], [code for code, value in enumerate(self.values(name)) if value in wanted])
 
     def __iter__(self) -> Iterator[Entry]:
@@ -156,7 +156,7 @@ def _check_entry(entry: Entry, number: int, checked: set[tuple[Any, ...]]) -> No
     for value in _names(entry):
         for name in [value] if isinstance(value, str) else [name for _, name in value or ()]:
             check_name(name)
-    check_membership(entry.track, entry.split, entry.layout)
+    check_layout_in_split(entry.track, entry.split, entry.layout)
     check_family(entry.teammate_family)
     expected = get_layout(entry.layout).obs_shape
     if entry.obs_shape != expected:
@@ -214,7 +214,7 @@ class Index:
         return self.entries.values(name)
 
     def query(self, **wanted: str | Sequence[str] | None) -> np.ndarray:
-        """Return the ids of the histories with the wanted field values, int64 (N,), ascending.
+        """Return the ids of the histories with the wanted field values, ascending, as int64 of shape (N,).
 
         Args:
             wanted: a value or a sequence of values for fields in `QUERY_FIELDS` or `ALIASES`; None accepts any value.

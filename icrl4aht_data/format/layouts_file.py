@@ -45,7 +45,7 @@ def layout_family(name: str) -> str:
 
 
 def read_layouts(root: Path) -> dict[str, Layout]:
-    """Return the layouts stored in a release by name, and make the layouts available to `get_layout`.
+    """Return a mapping of names to the layouts stored in a release, and make the layouts available to `get_layout`.
 
     Raises:
         IndexFormatError: if a line is malformed, if a name occurs twice or already belongs to another map, if a recipe
@@ -56,7 +56,7 @@ def read_layouts(root: Path) -> dict[str, Layout]:
 
 
 def read_layouts_file(path: Path) -> dict[str, Layout]:
-    """Return the layouts of a file by name, see `read_layouts`; no layouts if the file does not exist."""
+    """Return a mapping of names to the layouts in a file, see `read_layouts`; empty if the file does not exist."""
     layouts: dict[str, Layout] = {}
     for number, line in enumerate(read_lines(path) if path.is_file() else (), start=1):
         try:
@@ -69,7 +69,7 @@ def read_layouts_file(path: Path) -> dict[str, Layout]:
     return layouts
 
 
-@lru_cache(maxsize=1024)  # saves half of the time to open a release again
+@lru_cache(maxsize=1024)  # opening a release again takes half the time
 def _parse_line(line: str) -> Layout:
     """Return the layout that a line describes; see `read_layouts` for the errors."""
     fields = msgspec.json.decode(line, type=LayoutLine)
@@ -118,7 +118,7 @@ def layout_title(name: str) -> str:
 
 
 def _origin(name: str) -> tuple[str, int | None, int | None]:
-    """Return the family, seed and number that a generated layout's name contains; (OTHER, None, None) otherwise."""
+    """Return family, seed and number from the name of a generated layout; (OTHER, None, None) for other names."""
     generated = _GENERATED(name)
     return (OTHER, None, None) if generated is None else (generated[1], int(generated[2]), int(generated[3]))
 

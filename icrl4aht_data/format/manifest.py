@@ -14,7 +14,14 @@ from types import MappingProxyType
 
 from icrl4aht_data.errors import ChunkTableError, IndexFormatError, UnsafePathError
 from icrl4aht_data.format.schema import EXPERTS, INDEX_FILES, MANIFEST, PARQUET_EPISODES, PARQUET_INDEX, TEAMMATES
-from icrl4aht_data.utils.files import checked_hash, file_hash, is_safe_path, read_text, resolve_inside, write_atomically
+from icrl4aht_data.utils.files import (
+    file_hash,
+    is_safe_path,
+    read_text,
+    resolve_inside,
+    size_checked_hash,
+    write_atomically,
+)
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
@@ -101,7 +108,7 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
         path = resolve_inside(root, name)
         kind = ChunkTableError if name.startswith("meta/chunks/") else IndexFormatError
         try:
-            found = checked_hash(path)
+            found = size_checked_hash(path)
         except IndexFormatError as error:
             raise kind(str(error)) from error
         if name not in listed:

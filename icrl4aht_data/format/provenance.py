@@ -39,7 +39,7 @@ class StreamReturns(Struct, frozen=True, omit_defaults=True):
 
 
 class StreamFilter(Struct, frozen=True, omit_defaults=True):
-    """Mean returns of all recorded histories of a task (its streams), and of those in the release.
+    """Mean returns of all recorded streams of a task, and of the streams that became histories of the release.
 
     Args:
         before: returns of all recorded streams.
@@ -93,7 +93,7 @@ class TeammateSwaps(Struct, frozen=True, omit_defaults=True):
         return self.teammates[episode // self.every % len(self.teammates)]
 
     def spans(self, episodes: int) -> tuple[tuple[int, str], ...]:
-        """Return pairs (first episode, teammate id) for a number of episodes, see `Entry.teammate_of_episode`."""
+        """Return pairs (first episode, teammate id) of a history, see `Entry.teammate_of_episode`."""
         return tuple((first, teammate_id(self.teammate(first))) for first in range(0, episodes, self.every))
 
 
@@ -144,7 +144,7 @@ class ReferenceEgos(Struct, frozen=True, omit_defaults=True):
 
     @property
     def egos_differ(self) -> bool:
-        """Whether the returns of the best and the worst reference ego differ by at least `LEAST_HEADROOM`."""
+        """Whether the returns of the best and the worst measured ego differ by at least `LEAST_HEADROOM`."""
         return max(self.returns.values()) - min(self.returns.values()) >= LEAST_HEADROOM
 
     def describe(self) -> str:
@@ -152,7 +152,7 @@ class ReferenceEgos(Struct, frozen=True, omit_defaults=True):
         return ", ".join(f"{name} {value:.1f}" for name, value in self.returns.items())
 
 
-class NearestTest(Struct, frozen=True, omit_defaults=True):
+class NearestTestTeammate(Struct, frozen=True, omit_defaults=True):
     """The test teammate on the same layout whose behaviour is most similar to that of the task's teammate.
 
     Args:
@@ -214,7 +214,7 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
     learners: _Positive | None = None
     noise: dict[str, Any] | None = None
     references: ReferenceEgos | None = None
-    nearest_test: NearestTest | None = None
+    nearest_test: NearestTestTeammate | None = None
     teammate: dict[str, Any] | None = None
     streams_recorded: StreamCount | None = None
     streams_kept: StreamCount | None = None
@@ -271,11 +271,11 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
             IndexFormatError: if a value is wrong; the caller adds the file's path to the message.
         """
         if not isinstance(content, dict):
-            raise IndexFormatError("expected a JSON object that has one object for each task")
+            raise IndexFormatError("expected a JSON object with one object for each task")
         known = set(cls.__struct_fields__) - {"other"}
         try:
             found = msgspec.convert({name: value for name, value in content.items() if name in known}, cls)
-            msgspec.convert(found.ego, _EgoScale | None)
+            msgspec.convert(found.ego, _EgoSetting | None)
             msgspec.convert(found.teammate, _TeammateSetting | None)
             noise = msgspec.convert(found.noise or {}, _NoiseSetting)
             for name, value in msgspec.structs.asdict(noise).items():
@@ -292,7 +292,7 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
         )
 
 
-class _EgoScale(Struct):
+class _EgoSetting(Struct):
     """The ego's hyper-parameters that this package reads; other hyper-parameters are not checked."""
 
     total_steps: int
@@ -300,7 +300,7 @@ class _EgoScale(Struct):
 
 
 class _NoiseSetting(Struct):
-    """Settings of noise schedules that are validated; other settings are accepted unchecked."""
+    """Validated settings of noise schedules; other settings are accepted unchecked."""
 
     histories: _Positive | None = None
     episodes: _Positive | None = None
@@ -312,7 +312,7 @@ class _NoiseSetting(Struct):
 
 
 class _TeammateSetting(Struct, forbid_unknown_fields=True):
-    """Agent slot and noise source of a teammate; other fields are invalid, since the task defines the teammate."""
+    """Agent number and source of randomness of a teammate; other fields are invalid, since they belong to the task."""
 
     slot: Literal[1]
     noise: str | None = None

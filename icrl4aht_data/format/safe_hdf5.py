@@ -25,7 +25,7 @@ h5d, h5l, h5t, h5z = _low.h5d, _low.h5l, _low.h5t, _low.h5z
 SHUFFLE, DEFLATE = h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE
 
 _SUPERBLOCKS = tuple(b"\x89HDF\r\n\x1a\n" + bytes([version, 8, 8]) for version in (2, 3))  # 8-byte offsets and lengths
-_LOCAL_HEAP = re.compile(rb"HEAP\0.{8}\0{3}", re.DOTALL)  # libhdf5 rejects heaps of a terabyte or more
+_LOCAL_HEAP = re.compile(rb"HEAP\0.{8}\0{3}", re.DOTALL)  # \0{3}: libhdf5 rejects heaps of a terabyte or more
 
 _CHUNK_BYTES = 256 * 2**20
 _ELEMENT_BYTES = 2**16
@@ -48,7 +48,7 @@ def check_no_local_heap(path: Path) -> None:
 
 
 def find_node(group: Any, path: str) -> Any:
-    """Return the group or dataset at a path in a group; None if the path does not exist.
+    """Return the group or dataset at a path relative to a group; None if the path does not exist.
 
     Raises:
         ValueError: if a link on the path may point outside the file.
@@ -98,7 +98,7 @@ def filter_ids(dataset: Any) -> list[int]:
 
 
 def _type_class(what: Any) -> int:
-    """Return the HDF5 type class of a dataset or attribute, or of the elements if its type is an array."""
+    """Return the HDF5 type class of a dataset or attribute; for an array type, the class of the array's elements."""
     kind = what.get_type()
     return kind.get_super().get_class() if kind.get_class() == h5t.ARRAY else kind.get_class()
 

@@ -76,7 +76,7 @@ CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("c
 is padded), CRC-32 and hash of the stored bytes, see `chunks.check_chunk`. Table rows are ordered by history, field and
 chunk. Table rows for the HDF5 metadata between the chunks follow, with `rows` = 0, so the table covers every byte of
 the shard once. In the shard, the chunks of a history are ordered by time, so a window of steps is one byte range, see
-`shard_writer.file_order`."""
+`shard_writer.chunk_sort_key`."""
 
 
 @dataclass(frozen=True)
@@ -106,13 +106,13 @@ class Field:
     absent: tuple[Kind, ...] = ()
 
     def element(self, layout: Layout, kind: Kind) -> np.dtype:
-        """Return the dtype of a stored element: a scalar, a state record (S,) or an observation (5, 5, C)."""
+        """Return the dtype of a stored element: a scalar, a state of shape (S,) or an `obs` of shape (5, 5, C)."""
         if self.row == "scalar":
             return np.dtype(self.compact if kind == "lite" else self.dtype)
         return np.dtype(("u1", (record_size(layout),) if self.row == "state" else layout.obs_shape))
 
     def memory_dtype(self, layout: Layout) -> np.dtype:
-        """Return the dtype of an element in the memory of samplers: as in a `lite` shard, for every kind of release."""
+        """Return the dtype of an element in samplers' memory, which equals the dtype in a `lite` shard."""
         return self.element(layout, "lite")
 
 
@@ -136,7 +136,7 @@ ACTION_FIELDS = ("actions", "teammate_actions", "expert_actions", "oracle_action
 
 
 def memory_fields(kind: Kind) -> tuple[Field, ...]:
-    """Return the fields that samplers hold in memory: without `obs` if a release of this kind has state records."""
+    """Return the fields that samplers hold in memory; `obs` only for a kind of release without state records."""
     stored = kind if kind == OBSERVATIONS else "lite"
     return tuple(field for field in FIELDS.values() if stored not in field.absent)
 
@@ -150,7 +150,7 @@ MAX_STEPS = 2**40
 """Upper limit of the number of steps of a history, so that sums of steps fit into 64 bits."""
 
 _NAME_LENGTH = 512  # maximum number of characters
-_FINITE = 1e15  # limit of absolute values, so that sums of values stay finite
+_FINITE = 1e15  # limit of absolute values, which keeps sums of values finite
 
 _Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 StoredCount = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -299,12 +299,12 @@ def check_name(text: str) -> None:
 
 
 def episode_ends(steps: int, kept_steps: int) -> np.ndarray:
-    """Return bool (steps,), True for the last step of each episode of `kept_steps` steps."""
+    """Return a mask of shape (steps,), True for the last step of each episode of `kept_steps` steps."""
     return np.arange(steps) % kept_steps == kept_steps - 1
 
 
 def episode_returns(rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
-    """Return the sum of rewards of each episode, float64 (E,), from `rewards` (T,) and `dones` (T,)."""
+    """Return each episode's sum of rewards, float64 of shape (E,), from `rewards` and `dones` of shape (T,)."""
     ends = np.flatnonzero(dones) + 1
     return np.diff(np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)[ends - 1]]))
 
@@ -315,10 +315,10 @@ def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     With fewer than 10 episodes, which does not occur in the paper, w is half of N, but at least 1.
 
     Args:
-        returns: (B, N) or (N,), returns of the episodes in order.
+        returns: returns of the episodes in order, of shape (B, N) or (N,).
 
     Returns:
-        The mean return at the start and the mean return at the end, float64 (B,) or () each.
+        The mean return at the start and the mean return at the end, each float64 of shape (B,) or ().
     """
     episodes = returns.shape[-1]
     window = max(1, min(max(5, episodes // 10), episodes // 2))
@@ -329,7 +329,7 @@ def curve_fields(returns: np.ndarray) -> dict[str, float]:
     """Return the fields of an index line that summarize a learning curve: `return_start`, `return_end`, .., `score`.
 
     Args:
-        returns: (N,), returns of the history's episodes in order.
+        returns: returns of the history's episodes in order, of shape (N,).
     """
     start, end = curve_ends(returns)
     fields = {"return_start": start, "return_end": end, "return_mean": returns.mean(), "score": stream_score(returns)}
@@ -352,6 +352,13 @@ def are_labels_weak(expert_return: Any, return_end: Any) -> Any:
 
 
 def stream_score(returns: np.ndarray) -> np.ndarray:
-    """Return the score end + (end - start) of learning curves (B, N) or (N,), float64 (B,) or () (paper, App. F.1)."""
+    """Return the score end + (end - start) of each learning curve (paper, App. F.1).
+
+    Args:
+        returns: returns of the episodes in order, of shape (B, N) or (N,).
+
+    Returns:
+        float64 of shape (B,) or ().
+    """
     start, end = curve_ends(returns)
     return end + (end - start)

@@ -1,8 +1,8 @@
 """Names of observation channels, and the canonical channels, which are the same for all layouts.
 
-A layout's own channels depend on its number of ingredient types and on its delivery indicator, so observations of
-different layouts can differ in shape. The canonical channels are the union of all layouts' channels; channels that a
-layout does not have are 0.
+A layout's own channels depend on its number of ingredient types and on whether it has the delivery channel, so
+observations of different layouts can differ in shape. The canonical channels are the union of all layouts' channels;
+channels that a layout does not have are 0.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ def channel_names(layout: Layout) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def canonical_positions(layout: Layout) -> np.ndarray:
-    """Return the position of each of a layout's own channels in `CANONICAL_CHANNELS`, int64 (C,), ascending.
+    """Return the positions of a layout's own channels in `CANONICAL_CHANNELS`, ascending, as int64 of shape (C,).
 
     Raises:
-        OptionError: if an ingredient of the layout has no canonical channel: no published layout has the ingredient.
+        OptionError: if the layout has an ingredient that no published layout has, and so no canonical channel.
     """
     names = channel_names(layout)
     missing = [name for name in names if name not in CANONICAL_CHANNELS]
@@ -55,12 +55,19 @@ def observation_shape(layout: Layout, canonical: bool = False) -> tuple[int, int
 
 
 def to_canonical(layout: Layout, obs: Array) -> Array:
-    """Convert observations (..., C) with a layout's own channels to the canonical channels, (..., 46), in NumPy or JAX.
+    """Convert observations with a layout's own channels to the canonical channels, in NumPy or JAX.
 
     The result equals `observe` with canonical=True.
+
+    Args:
+        layout: the layout.
+        obs: observations of shape (..., C).
+
+    Returns:
+        Observations of shape (..., 46).
     """
     xp = obs.__array_namespace__()
-    # Canonical channels that the layout does not have are copies of an appended channel of zeros.
+    # Canonical channels that the layout does not have are taken from an appended channel of zeros.
     source = np.full(len(CANONICAL_CHANNELS), layout.channels)
     source[canonical_positions(layout)] = np.arange(layout.channels)
     return xp.take(xp.concat([obs, xp.zeros_like(obs[..., :1])], axis=-1), xp.asarray(source), axis=-1)

@@ -218,7 +218,7 @@ def _draw_indicator(layout: Layout, canvas: Canvas, x: float, y: float, recipe: 
 
 
 def _draw_pot(layout: Layout, canvas: Canvas, x: float, y: float, item: int, timer: int) -> None:
-    """Draw a pot: rings for free slots, an orange rim and the remaining steps while cooking, a green tick if cooked."""
+    """Draw a pot: rings for missing ingredients, an orange rim and the steps left while cooking, a tick if cooked."""
     contents, cooked = item_contents(layout, item), item & COOKED > 0
     canvas.box(x, y, 0.9, 0.9, _DARK_STEEL, 0.08)
     canvas.strokes([(0.12, _STEEL, (-0.4, 0), (0.4, 0))], x, y - 0.05)
@@ -236,7 +236,7 @@ def _draw_pot(layout: Layout, canvas: Canvas, x: float, y: float, item: int, tim
 
 
 def _draw_button(layout: Layout, canvas: Canvas, x: float, y: float, recipe: int, timer: int) -> None:
-    """Draw a button: a question mark, or while the button is lit, the recipe in a ring that shows the time left."""
+    """Draw a button: a question mark if unlit, or the recipe in a ring that shows the time left if lit."""
     canvas.box(x, y, 0.88, 0.88, _DARK_STEEL, 0.2)
     canvas.disc(x, y, 0.42, _LAMP, timer / BUTTON_STEPS)
     canvas.disc(x, y, 0.35, PAPER if timer else _STEEL)
@@ -258,7 +258,7 @@ def _draw_item(layout: Layout, canvas: Canvas, x: float, y: float, item: int, *,
 
 
 def _draw_contents(canvas: Canvas, contents: list[int], x: float, y: float, radius: float, empty=None) -> None:
-    """Draw up to three ingredients in a triangle, with rings of colour `empty` for free slots."""
+    """Draw up to three ingredients in a triangle, with rings of colour `empty` for missing ingredients."""
     for number, (dx, dy) in enumerate(((0, -0.95), (-1.02, 0.75), (1.02, 0.75))):
         centre = (x + dx * radius, y + dy * radius)
         if number < len(contents):

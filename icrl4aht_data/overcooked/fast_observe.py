@@ -1,9 +1,9 @@
 """Fast rendering of the ego's observations from state records, with NumPy, into reusable buffers.
 
-`observe` defines observations, for NumPy and JAX. This module calls `observe` once for every value of each record
-element and stores the results in lookup tables. An observation is then a copy of a background, selected by the ego's
-cell, the recipe and the delivery flag, and of small patches: both agents by facing and item, and the contents of
-counters, pots and lit buttons.
+The function `observe` defines the observations, for NumPy and JAX. This module calls `observe` once for every value of
+each record element and stores the results in lookup tables. An observation is then a copy of a background, selected by
+the ego's cell, the recipe and the delivery flag, and of small patches: both agents by facing and item, and the contents
+of counters, pots and lit buttons.
 
 `n` denotes the number of steps, `S` the bytes of a state record, `A` the channels of one agent, `C` all channels.
 """
@@ -64,7 +64,7 @@ def fast_observe(
 
 
 class _Renderer:
-    """Function from state records to observations by lookup tables, for one layout, dtype and kind of channels."""
+    """Renders observations from state records with lookup tables, for one layout, dtype and choice of channels."""
 
     def __init__(self, layout: Layout, dtype: str, canonical: bool) -> None:
         self._layout, self._dtype, self._canonical = layout, np.dtype(dtype), canonical
@@ -77,7 +77,7 @@ class _Renderer:
         self._recipes = np.append(np.uint8(0), possible_recipes(layout))
         self._in_window = layout.window_position.astype(np.intp)
         self._background = self._make_background()
-        self._agents = _as_items(self._make_agents())
+        self._agents = _as_items(self._make_agent_channels())
         self._patches = _as_items(self._make_patches())
         self._make_pair_lookups()
         self._make_cell_lookups()
@@ -90,7 +90,7 @@ class _Renderer:
         background = self._by_positions.take(positions)
         background += self._by_recipe.take(recipe)
         if background.min() < 0 or (facings & 0xFCFC).any() or (record[:, self._columns.pot_timers] >= _TIMERS).any():
-            # The tables have no entries for records that the rules cannot produce; `observe` renders their blocks.
+            # A record that the rules cannot produce has no table entries. `observe` then renders all given records.
             out.reshape(len(out), *self._shape)[...] = self._observe(record)
             return
         # mode="clip" avoids the temporary copy of `out` that the default mode makes in case an index is out of range.
@@ -112,7 +112,7 @@ class _Renderer:
         teammate[seen * VISIBLE + where[seen]] = self._agents.take((facings[seen] & 0xFF00) + (hands[seen] >> 8))
 
     def _render_cells(self, record: np.ndarray, positions: np.ndarray, cells: np.ndarray) -> None:
-        """Render visible pots with content, lit buttons and items on counters; the background shows all other cells."""
+        """Render visible cells that differ from the background: filled pots, lit buttons, and counters with an item."""
         filled = record[:, self._cell_columns].copy()
         filled[:, : self._pots] |= record[:, self._columns.pot_timers]
         row, cell = np.divmod(np.flatnonzero(filled), filled.shape[1])
@@ -129,10 +129,10 @@ class _Renderer:
         _as_items(cells[:, self._first :])[row * VISIBLE + where] = self._patches.take(patch)
 
     def _make_pair_lookups(self) -> None:
-        """Make lookup tables intp (2**16,), indexed by pairs of bytes as low + 256 * high.
+        """Make lookup tables with one entry for each pair of bytes, at index low byte + 256 * high byte.
 
-        Entries of `_by_positions` and `_by_recipe` are < 0 for pairs that the background does not cover; otherwise the
-        two entries add up to the row of the background.
+        The background row of a state is its entry of `_by_positions` plus its entry of `_by_recipe`. An entry is
+        negative if the background has no row for the pair.
         """
         low, high = np.arange(2**16) & 255, np.arange(2**16) >> 8
         cells = self._layout.cells
@@ -142,7 +142,7 @@ class _Renderer:
         self._teammate_in_window = np.where(on_map, self._in_window[low % cells, high % cells], NOWHERE)
 
     def _make_cell_lookups(self) -> None:
-        """Make lookup tables for the cells that can change, in the order pots, buttons, counters."""
+        """Make lookup tables of the cells that can change: first the pots, then the buttons, then the counters."""
         layout, where = self._layout, self._columns
         pots, buttons, counters = map(len, (layout.pots, layout.buttons, layout.counters))
         self._pots = pots
@@ -153,7 +153,10 @@ class _Renderer:
         self._patch_column = np.where(self._first_patch == _ON_BUTTON, where.recipe, self._cell_columns)
 
     def _make_background(self) -> np.ndarray:
-        """Return observations of the empty map, (floor * recipes * 2, 25 * C), by ego cell, recipe, delivery flag."""
+        """Return observations of the empty map, an array of shape (floor cells * recipes * 2, 25 * C).
+
+        The rows are ordered by ego cell, then by recipe, then by delivery flag.
+        """
         shape = len(self._floor), len(self._recipes), 2
         record = np.zeros((*shape, record_size(self._layout)), np.uint8)
         record[..., 0], record[..., self._columns.recipe] = self._floor[:, None, None], self._recipes[:, None]
@@ -162,8 +165,8 @@ class _Renderer:
         obs[..., : 2 * self._agent] = 0
         return obs.reshape(np.prod(shape), -1).astype(self._dtype)
 
-    def _make_agents(self) -> np.ndarray:
-        """Return the channels of one agent for each facing and item byte, (4 * 256, A)."""
+    def _make_agent_channels(self) -> np.ndarray:
+        """Return one agent's channels, of shape (4 * 256, A), with row facing * 256 + item byte."""
         record = np.zeros((4, 256, record_size(self._layout)), np.uint8)
         record[..., 0], record[..., 1] = self._floor[0], self._floor[-1]
         record[..., self._columns.facings] = np.arange(4)[:, None, None]
@@ -172,7 +175,10 @@ class _Renderer:
         return obs[:, CENTRE, : self._agent].astype(self._dtype)
 
     def _make_patches(self) -> np.ndarray:
-        """Return a cell's channels that can change, (512 + 32 * 256, C - `_first`), by content, see `_ON_COUNTER`."""
+        """Return the changing channels of a cell for each content, of shape (512 + 32 * 256, C - `_first`).
+
+        The docstring of `_ON_COUNTER` says which row shows which content.
+        """
         layout, where = self._layout, self._columns
         every_byte = np.arange(256, dtype=np.uint8)
         record = np.zeros((2 + _TIMERS, 256, record_size(layout)), np.uint8)
@@ -193,12 +199,12 @@ class _Renderer:
 
 
 def _as_items(rows: np.ndarray) -> np.ndarray:
-    """View each row of an array (n, k) as a single item, (n,), since NumPy copies an item in one operation."""
+    """View an array of shape (n, k) as n items, one for each row, since NumPy copies an item in one operation."""
     return rows.view(np.dtype((np.void, rows.shape[-1] * rows.itemsize)))[..., 0]
 
 
 def _index_of(values: np.ndarray) -> np.ndarray:
-    """Return the position of each byte in `values`, intp (256,); `_IMPOSSIBLE` for a byte that is not in `values`."""
+    """Return an array of shape (256,) with each byte's position in `values`; `_IMPOSSIBLE` for all other bytes."""
     lookup = np.full(256, _IMPOSSIBLE, np.intp)
     lookup[values] = np.arange(len(values))
     return lookup

@@ -195,7 +195,7 @@ class Layout:
 
     @cached_property
     def ahead(self) -> np.ndarray:
-        """uint8 (cells, 4): cell in front of an agent, by cell and facing; 0 if the agent's cell is not walkable."""
+        """uint8 (cells, 4): cell ahead, by the agent's cell and facing; 0 if the agent's cell is not walkable."""
         steps = [dy * self.width + dx for dx, dy in (STEP[name] for name in FACINGS)]
         return np.where(self.walkable[:, None], np.arange(self.cells)[:, None] + steps, 0).astype(np.uint8)
 
@@ -233,7 +233,7 @@ class Layout:
 
     @cached_property
     def window_position(self) -> np.ndarray:
-        """uint8 (cells, cells): position of the second cell in the window around the first cell, or NOWHERE."""
+        """uint8 (cells, cells): position of the second cell in the window of the first cell; NOWHERE if outside."""
         table = np.full((self.cells, self.cells), NOWHERE, np.uint8)
         cell, position = np.nonzero(self.window >= 0)
         table[cell, self.window[cell, position]] = position
@@ -370,7 +370,7 @@ class LayoutLine(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 @cache
 def _manifest_layouts() -> dict[str, Layout]:
-    """Return, by name, the layouts of this package's tasks beyond the ten layouts of the benchmark."""
+    """Return the layouts of this package's tasks that are not among the benchmark's ten layouts, by name."""
     path = Path(__file__).parent.parent / "manifests" / "layouts.jsonl"
     lines = msgspec.json.Decoder(LayoutLine).decode_lines(path.read_bytes())
     return {line.name: line.layout() for line in lines}
@@ -390,7 +390,7 @@ def add_layouts(layouts: Iterable[Layout]) -> list[Layout]:
     """Make layouts, such as those stored in an opened release, available to `get_layout` in this process.
 
     Returns:
-        The layouts; a layout that was already available is returned as the earlier object.
+        The layouts; for a layout that was already available, the existing object.
 
     Raises:
         OptionError: if a layout has the name of a different available layout.

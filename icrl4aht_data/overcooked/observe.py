@@ -80,7 +80,7 @@ def _expand(tables: Tables, agents: Array, cells: Array, canonical: bool) -> Arr
 
 
 def _packed_words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
-    """Return two packed words per visible cell, uint32 (B, 25) each: for an agent on the cell, and for the cell."""
+    """Return two packed words per visible cell, uint32 (B, 25) each: of the agent on the cell, and of the cell."""
     xp = record.__array_namespace__()
     state = unpack(tables, record)
     me, other = state.positions[..., agent], state.positions[..., 1 - agent]
@@ -91,7 +91,7 @@ def _packed_words(tables: Tables, record: Array, agent: int) -> tuple[Array, Arr
 
     bodies = 1 | xp.astype(1 << (xp.astype(state.facings, xp.uint32) + 1), xp.uint32)
     bodies = bodies | xp.astype(state.hands, xp.uint32) << 5
-    # NOWHERE is the number of all cells outside the map. A cell has at most one agent, and NOWHERE has none.
+    # Every cell outside the map has the cell number NOWHERE, which no agent's cell has.
     cell, none = view >> CELL_BIT, xp.zeros_like(cells)
     agents = xp.where(cell == me[..., None], bodies[..., agent, None], none) | xp.where(
         cell == other[..., None], bodies[..., 1 - agent, None] << AGENT_BITS, none
@@ -100,7 +100,11 @@ def _packed_words(tables: Tables, record: Array, agent: int) -> tuple[Array, Arr
 
 
 def _packed_changing_cells(xp, state: State) -> Array:
-    """Return packed words uint32 (B, 3 + P + L + K): zero for fixed cells; indicator, goal, pots, buttons, counters."""
+    """Return the packed words of the cells that can change, uint32 of shape (B, 3 + P + L + K).
+
+    The words are, in this order: zero for all fixed cells, one word for all recipe indicators, one for all goals, and
+    one for each of the P pots, L buttons and K counters.
+    """
     # The shift by 2 removes the plate and cooked flags, which a recipe never has.
     recipe = xp.astype(state.recipe >> 2, xp.uint32)[..., None] << RECIPE_BIT
     delivered = xp.astype(state.delivered, xp.uint32)[..., None] << DELIVERY_BIT

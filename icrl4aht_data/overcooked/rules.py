@@ -138,7 +138,7 @@ def _interact(
     faced = look_up(tables.faced.reshape(-1), pose)
     kind, pile, number = faced & 255, xp.astype(faced >> 8 & 255, xp.uint8), faced >> 16
     facing_pot, facing_counter = acting & (kind == POT), acting & (kind == WALL)
-    # Items are read and written by one-hot masks over the few cells with items, without a scatter.
+    # One-hot masks over pots, counters and buttons select the faced cell, so gather and scatter are not needed.
     at_pot = (number[..., None] == _indices(xp, len(tables.pots))) & facing_pot[..., None]
     at_counter = (number[..., None] == _indices(xp, len(tables.counters))) & facing_counter[..., None]
     at_button = (number[..., None] == _indices(xp, len(tables.buttons))) & (acting & (kind == BUTTON))[..., None]

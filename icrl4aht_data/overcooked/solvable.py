@@ -35,24 +35,24 @@ def _delivery_fault(layout: Layout) -> str | None:
     counters = bool((reach.all(axis=0) & (layout.kinds == WALL)).any())
 
     def agents_facing(fixtures: np.ndarray) -> np.ndarray:
-        """Return bool (2,), True for agents that can face a cell of the mask `fixtures`, bool (N,)."""
+        """Return a mask, bool (2,), of the agents that can face at least one cell of the mask `fixtures`, bool (N,)."""
         return np.any(reach & fixtures, axis=1)
 
-    def after_handover(agents: np.ndarray) -> np.ndarray:
-        """Return bool (2,), True for agents that can get an item that the agents of a mask, bool (2,), can take."""
+    def agents_that_can_get(agents: np.ndarray) -> np.ndarray:
+        """Return a mask, bool (2,), of the agents that can get an item, given a mask of those that can take it."""
         return agents | (counters and agents.any())
 
     for kind, what in _NEEDED.items():
         if not agents_facing(layout.kinds == kind).any():
             return f"no agent can face {what}"
     pots = reach[:, layout.kinds == POT]  # (2, P), True for pots that each agent can face
-    plates, goals = after_handover(agents_facing(layout.kinds == PLATES)), agents_facing(layout.kinds == GOAL)
-    served = [pot for pot in pots.T if (after_handover(pot & plates) & goals).any()]
+    plates, goals = agents_that_can_get(agents_facing(layout.kinds == PLATES)), agents_facing(layout.kinds == GOAL)
+    served = [pot for pot in pots.T if (agents_that_can_get(pot & plates) & goals).any()]
     if not served:
         return "no soup can reach a goal on a plate"
     for recipe in layout.recipes:
         piles = {one: (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(one)) for one in recipe}
-        available = {ingredient: after_handover(agents_facing(piles[ingredient])) for ingredient in sorted(piles)}
+        available = {ingredient: agents_that_can_get(agents_facing(piles[ingredient])) for ingredient in sorted(piles)}
         for ingredient, agents in available.items():
             if not any((pot & agents).any() for pot in served):
                 return f"ingredient {ingredient} cannot reach a pot whose soup can be delivered"

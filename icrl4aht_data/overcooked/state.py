@@ -80,7 +80,7 @@ def _count_changing_cells(layout: Layout | Tables) -> tuple[int, int, int]:
     return pots, buttons, counters
 
 
-def padded_positions(layout: Layout, tables: Tables) -> np.ndarray:
+def padded_columns(layout: Layout, tables: Tables) -> np.ndarray:
     """Return the columns of padded state records that hold the bytes of one layout's state records.
 
     Args:
@@ -102,7 +102,7 @@ def unpack(layout: Layout | Tables, record: Array) -> State:
 
 
 def pack(state: State) -> Array:
-    """Join the fields of states to state records uint8 (B, S)."""
+    """Join fields into state records uint8 (B, S); the inverse of `unpack`."""
     xp = state.positions.__array_namespace__()
     single = (state.recipe[..., None], state.delivered[..., None])
     return xp.concat([*state[:3], *single, *state[5:]], axis=-1)
@@ -115,7 +115,7 @@ def swap_agents(record: Array) -> Array:
     return record[..., order]
 
 
-def start_record(layout: Layout | Tables, positions: Array, facings: Array, recipe: Array) -> Array:
+def initial_record(layout: Layout | Tables, positions: Array, facings: Array, recipe: Array) -> Array:
     """Return the state record of an episode's first step, with empty hands, pots and counters (paper, App. A.1).
 
     Args:
@@ -141,10 +141,11 @@ def possible_recipes(layout: Layout) -> np.ndarray:
 
 
 def faults(layout: Layout, record: np.ndarray) -> list[str]:
-    """Return descriptions of impossible values in records uint8 (B, S); empty if every value is in range.
+    """Return descriptions of impossible values in records uint8 (B, S), or an empty list if all values are possible.
 
-    Each value is checked against its range: distinct floor cells of the agents, possible item bytes and timers, a
-    recipe of three ingredients. Whether the rules can reach the state is not checked.
+    Agents must be on distinct reachable floor cells, item bytes and timers must be possible, a recipe must have three
+    ingredients, and a pot must cook exactly while it contains three raw ingredients. Whether the rules can reach the
+    state is not checked.
     """
     state = unpack(layout, record)
     items = possible_items(layout)

@@ -167,7 +167,7 @@ def stack_padded(parts: Sequence[Any], padding: Mapping[str, int]) -> Any:
     """Stack named tuples of arrays on a new first axis; arrays are padded at the end of each axis to equal shapes.
 
     Args:
-        parts: named tuples of arrays, possibly nested; equal fields may have different lengths.
+        parts: named tuples of arrays, possibly nested; the arrays of one field may have different lengths.
         padding: padding values other than 0, by field. The field "recipes" is padded with its last entry, since a
             repeated recipe changes no decision of a scripted agent.
     """
@@ -278,7 +278,7 @@ def _make_view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> n
     for bit, ingredient in enumerate(layout.ingredients):
         pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
         fixed |= pile.astype(np.int32) << (_PILES - FIXED_BIT + bit)
-    # A cell outside the map has the number NOWHERE, no fixed bits, and changing word 0, which is always zero.
+    # Outside the map: cell number NOWHERE, no fixed bits, and the changing word with number 0, which is always zero.
     packed = changing | fixed << 8 | np.arange(layout.cells) << CELL_BIT
     return np.where(layout.window >= 0, packed[layout.window], NOWHERE << CELL_BIT).astype(np.int32)
 

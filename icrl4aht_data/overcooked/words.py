@@ -80,7 +80,7 @@ class CellWords:
                 self._words[number, kind, pairs] = next(parts)
 
     def _fill_views(self, fixed: list[np.ndarray]) -> None:
-        """Fill the lookup tables by the observer's cell and by slot, see `_Slot`; slot 0 stands for fixed cells."""
+        """Fill the lookup tables indexed by the observer's cell or by slot, see `_Slot`; slot 0 is for fixed cells."""
         count, cells = len(self.layouts), max(layout.cells for layout in self.layouts)
         slots = [[_Slot(_FIXED, [], 0), *_slots(layout)] for layout in self.layouts]
         self._slot = np.zeros((count, cells, VISIBLE), np.uint8)
@@ -121,7 +121,7 @@ class CellWords:
             number = xp.astype(xp.broadcast_to(number, batch), xp.int32)
 
         def layout_values(table: np.ndarray, *indices: Array) -> Array:
-            """Return `table[number, *indices]`, where `number` is the number of each record's layout."""
+            """Return `table[number, *indices]`, where `number` is the index of each record's layout in `layouts`."""
             flat = number
             for index, size in zip(indices, table.shape[1:], strict=False):
                 flat = flat * size + xp.astype(index, xp.int32)

@@ -49,7 +49,7 @@ def build_release(
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`, or a library is not installed.
-        ReleaseError: if `source` is not valid; the message names three problems.
+        ReleaseError: if `source` is not valid (the message names the first three problems), or changes while copied.
     """
     source, target = as_path(MINI if source is None else source).resolve(), as_path(target)
     check_target(target, overwrite, [source])

@@ -33,7 +33,7 @@ _FORMATS = {
     ".parquet": "application/x-parquet",
     ".safetensors": "application/vnd.safetensors",
 }
-_TYPES = {"bool": "BOOL", "string": "TEXT", "float": "FLOAT", "double": "FLOAT"}  # by Arrow type; others are INTEGER
+_TYPES = {"bool": "BOOL", "string": "TEXT", "float": "FLOAT", "double": "FLOAT"}  # other Arrow types: INTEGER
 _TERMS_OF_1_1 = {
     "arrayShape": "cr:arrayShape",
     "containedIn": "cr:containedIn",

@@ -34,7 +34,7 @@ class Upload:
         creates: whether a new repository is created.
         private: whether a private repository was requested.
         deletes: files of another version, which are removed from the repository.
-        commit: the tagged commit; None in a dry run.
+        commit: the tagged commit; None if the tag does not exist yet.
     """
 
     repo: str
@@ -51,7 +51,7 @@ class Upload:
         return asdict(self) | {"bytes": sum(self.files.values())}
 
     def report_lines(self) -> list[str]:
-        """Return lines of text for printing: all files in a dry run, otherwise a summary."""
+        """Return lines of text for printing: all files if the upload is only planned, otherwise a summary."""
         total = f"{len(self.files)} files, {sum(self.files.values()):,} bytes"
         if self.done != "nothing":
             return [f"{self.url}: {self.done}, {total}; tag {self.tag} is commit {self.commit}"]

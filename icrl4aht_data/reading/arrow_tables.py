@@ -1,7 +1,8 @@
 """Arrow tables of the index and the episodes, used for Parquet files and Hugging Face datasets.
 
-A row contains one episode with all stored fields. Lists have fixed lengths: `steps` elements, one per step, and `width`
-bytes for a state record. Shorter records are padded with zeros, so one table can hold episodes of all layouts.
+In the table of episodes, a row contains one episode with all stored fields. Lists have fixed lengths: `steps` elements,
+one per step, and `width` bytes for a state record. Shorter records are padded with zeros, so one table can hold
+episodes of all layouts.
 """
 
 from __future__ import annotations

@@ -17,7 +17,14 @@ from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import LABELS, History, Labels, Obs
 from icrl4aht_data.reading.shard import Shards
-from icrl4aht_data.reading.sources import CacheChoice, CacheMode, HistorySource, choose_cache, decoded_size, open_source
+from icrl4aht_data.reading.sources import (
+    CacheChoice,
+    CacheMode,
+    HistorySource,
+    choose_cache,
+    decoded_size,
+    open_history_source,
+)
 from icrl4aht_data.utils.install_hints import import_optional
 from icrl4aht_data.utils.options import check_int, check_number, check_options, check_position, take_slice
 from icrl4aht_data.utils.system import usable_cores
@@ -96,7 +103,7 @@ class Selection:
                 f'obs = "state": {self.origin} has observations only, no state records; use float32 or uint8'
             )
 
-    # Pickles, which data loaders send to their workers, omit decoded arrays; each worker opens its own.
+    # Data loaders send a pickled selection to each worker. The pickle has no decoded arrays; workers open their own.
     def __getstate__(self) -> tuple:
         return self._shards, self.options, self.ids
 
@@ -296,7 +303,7 @@ class Selection:
     def storage(self) -> HistorySource:
         """Reader of the selection's rows in cache mode `cache`; `ram` and `mmap` decode all rows on first access."""
         if self._source is None:  # no lock, which a fork could leave locked; parallel accesses may decode twice
-            self._source = open_source(self.cache.cache, self.entries, self._shards, self.threads)
+            self._source = open_history_source(self.cache.cache, self.entries, self._shards, self.threads)
         return self._source
 
     def clear_chunk_cache(self) -> None:
@@ -348,7 +355,7 @@ class Selection:
             OptionError: if `predicate` is not a function that returns a bool, or `min_expert_return` is not a number.
             NotStoredError: for `min_expert_return`, if the expert return of a remaining history is unknown.
         """
-        # The query covers the release; `isin` keeps this selection's order and repeated histories.
+        # The query searches the whole release; `isin` keeps the order and the repeated histories of this selection.
         named = ", ".join(f"{name} = {value!r}" for name, value in wanted.items() if value is not None)
         found = self._select_if(np.isin(self.ids, self.index.query(**wanted)), f"has {named}")
         if learner is not None:

@@ -215,7 +215,7 @@ class Shard:
         return rows
 
     def checked_bytes(self, row: int) -> bytes:
-        """Return the stored bytes of the chunk in one row of the chunk table, after checking their hash.
+        """Return the stored bytes of a chunk, given its row in the chunk table, after checking their hash.
 
         Raises:
             ShardCorruptError: if the bytes are damaged; the message names the chunk.

@@ -1,6 +1,6 @@
 """Cache modes for the histories of a selection: `ram`, `mmap` and `stream`, which return the same rows.
 
-ram      records and scalars decoded once into concatenated arrays in memory; reading a window is one copy
+ram      records and scalar fields, decoded once into concatenated arrays in memory; reading a window is one copy
 mmap     the arrays of `ram`, decoded once into the cache folder and memory-mapped, shared by processes
 stream   chunks read, checked and inflated on threads when a window needs them
 
@@ -81,7 +81,7 @@ def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episode
     return sum(rows[field.axis] * field.memory_dtype(layout).itemsize for field in memory_fields(kind))
 
 
-def open_source(cache: CacheMode, entries: Sequence[Entry], shards: Shards, threads: int) -> HistorySource:
+def open_history_source(cache: CacheMode, entries: Sequence[Entry], shards: Shards, threads: int) -> HistorySource:
     """Open a source for the rows of a selection's histories; `ram` and `mmap` decode all histories.
 
     Args:
@@ -103,7 +103,7 @@ def open_source(cache: CacheMode, entries: Sequence[Entry], shards: Shards, thre
 
 
 def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: int) -> dict[str, np.ndarray]:
-    """Return memory-mapped arrays from the cache folder, found by a hash of their content; decode missing arrays."""
+    """Return memory-mapped arrays of one layout's histories from the cache folder; decode missing arrays first."""
     layout = shards[0].layout
     digest = hashlib.blake2b(f"{_VERSION} {layout.name} {layout.rows}".encode(), digest_size=16)
     for entry, shard in zip(entries, shards, strict=True):
@@ -121,7 +121,7 @@ def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: i
 def _decode(
     entries: Sequence[Entry], shards: Sequence[Shard], threads: int, folder: Path | None = None
 ) -> dict[str, np.ndarray]:
-    """Decode one layout's histories to arrays (rows, ...) by field, in memory or memory-mapped in files of a folder."""
+    """Decode one layout's histories to an array for each field, in memory or memory-mapped in files of a folder."""
     arrays = {}
     for field in memory_fields(shards[0].kind):
         if any(entry.has(field) for entry in entries):
@@ -155,7 +155,7 @@ def _first_rows(entries: Sequence[Entry], axis: str) -> np.ndarray:
 
 
 class FlatSource:
-    """Source that reads concatenated histories from arrays in memory or memory-mapped arrays, one set per layout."""
+    """Source that reads from arrays of concatenated histories, in memory or memory-mapped, with one set per layout."""
 
     def __init__(self, entries: Sequence[Entry], threads: int) -> None:
         self._ids, self._threads = np.array([entry.history_id for entry in entries]), threads
@@ -195,7 +195,7 @@ class FlatSource:
                 out[chosen, ..., part.shape[-1] :] = 0
 
     def _read_layout(self, array: np.ndarray, request: ReadRequest) -> None:
-        """Fill the array of a read request whose histories are all in `array`."""
+        """Fill `request.out` from `array`, which contains all histories of the request."""
         name, histories, rows, out = request
         first, count, length = self._first[FIELDS[name].axis][histories], self._rows[FIELDS[name].axis], out.shape[1]
         if rows.ndim == 2:
@@ -212,7 +212,7 @@ class FlatSource:
 
 
 def gather_rows(array: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
-    """Copy array[rows[i, j]] to out[i, j], converted to the dtype of `out`; indices are clipped."""
+    """Copy array[rows[i, j]] to out[i, j], converted to the dtype of `out`; indices out of range are clipped."""
     if out.dtype == array.dtype:
         np.take(array, rows, axis=0, out=out, mode="clip")  # with other modes, NumPy makes an additional copy
     else:
@@ -220,7 +220,7 @@ def gather_rows(array: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
 
 
 def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None:
-    """Copy rows first..first + K of array (N, ...) into out (n, K, ...), C-contiguous, one block per window."""
+    """Copy array[first[i] : first[i] + K] to out[i] as one block; `out`, of shape (n, K, ...), is C-contiguous."""
     size = array[0].size
     flat, width = array.reshape(-1), out.shape[1] * size
     # `np.ndarray` makes this view of all windows 20 microseconds faster than `sliding_window_view`.

@@ -178,7 +178,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         if self.every == 1:
             # A window given by its first row is copied as a block, ten times faster than L single rows.
             return position, low + start, low + start, low + start - 1, valid
-        # `t` numbers the steps of every n-th episode: step t % steps of episode first + n * (t // steps) of the range.
+        # `t` counts only steps of every n-th episode: t means step t % steps of episode first + n * (t // steps).
         # The step before the window comes first, for `prev_*`. Padding repeats the last step, since rows must exist.
         t = np.minimum(start[:, None] + np.arange(-1, self.length), total[:, None] - 1)
         rows = low[:, None] + (first[:, None] + self.every * (t // steps)) * steps + t % steps
@@ -218,7 +218,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         batch.attention_mask[...] = True
         if valid.min() < self.length:
             np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)
-            # Padding is set to zero: rows of later episodes were read, or observations were rendered from zeros.
+            # Padding contains steps of later episodes, or observations rendered from zeros, and is set to zero here.
             for array in (batch.obs, *(read.out for read in reads[1:])):
                 array[~batch.attention_mask] = 0
         return batch

@@ -180,7 +180,7 @@ class Sampler(Generic[B, D, T]):
 
     def _layout_specs(self) -> dict[str, ArraySpec]:
         """Return dtype and shape of the field `layouts`; {} unless batches have state records of several layouts."""
-        # A state record cannot be interpreted without its layout, a rendered observation can.
+        # Unlike a rendered observation, a state record cannot be interpreted without its layout.
         several = self.dataset.obs == "state" and len(self.layouts) > 1
         return {"layouts": ArraySpec("int32", (self.local_size,))} if several else {}
 

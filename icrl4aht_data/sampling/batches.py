@@ -72,7 +72,7 @@ class Batches(Iterator[B], Generic[B]):
         self._lent: B | None = None  # buffer of the batch in use by the consumer
 
     def __iter__(self) -> Batches[B]:
-        # A new pass starts only after a loop reached the end: if a position at the end is loaded, a loop is empty.
+        # A new pass starts only if a loop reached the end. After loading a position at the end, the next loop is empty.
         if self._ended and self._stop is not None and self._per_pass:
             self._stop += (self.next - self._stop) // self._per_pass * self._per_pass + self._per_pass
             self._closed = self._ended = False

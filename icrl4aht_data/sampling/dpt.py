@@ -109,12 +109,13 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         self.queries = check_int("queries", queries, 1)
         super().__init__(dataset, batch_size=batch_size, length=context, **options)
         check_choice("order", order, CONTEXT_ORDERS)
-        # The shortest part of a curriculum is its first or its last part; batch 2**62 has the last part.
+        # A curriculum's part changes linearly, so it is shortest at batch 0 or at the end, as in batch 2**62.
         ranges = (map(self._count_transitions, self._draws.steps(i)) for i in (0, 2**62))
         shortest = min(int((high - low).min()) for low, high in ranges)
         if (self.length if order == "contiguous" else 1) > shortest:
             raise OptionError(
-                f"context = {context}: the shortest history has {shortest} transitions; choose a smaller context"
+                f"context = {context}: the shortest history has {shortest} transitions to draw from; choose a smaller "
+                f"context"
             )
         check_labels(dataset, labels)
         self.order, self.labels = order, labels
@@ -147,12 +148,12 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         query_records = observer.records(batch.query_obs)
         records, next_records = observer.records(batch.context_obs), observer.records(batch.context_next_obs)
         if self.order == "contiguous" and self.dataset.has_states:
-            # Windows given by their first row are copied as blocks. The row after the end of a history has zeros.
+            # A window requested by its first row is copied as a block. The row after the end of a history is zero.
             rows, next_rows = steps[:, 0], steps[:, 0] + 1
         else:
             # Single rows after a history's end cannot be read: the history's last row is read, and replaced below.
             rows, next_rows = steps, np.minimum(steps + 1, self._draws.lengths[context][:, None] - 1)
-        # A `ReadRequest` needs an axis for queries, which the batch's arrays do not have for one query per context.
+        # A `ReadRequest` needs an axis of queries, which the batch's arrays have only for several queries per context.
         queries, record = query_steps.shape, records.shape[2:]
         reads = [
             ReadRequest(f"{self.labels}_actions", query, query_steps, batch.query_target.reshape(queries)),

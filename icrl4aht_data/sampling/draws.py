@@ -101,7 +101,7 @@ def weighted_choice(random: np.ndarray, weights: np.ndarray | None, first: Any, 
     """
     if weights is None:
         return first + scale_to_range(random, stop - first)
-    # side="right" skips the empty interval between two equal edges, which a weight of 0 makes.
+    # A weight of 0 gives two equal edges; side="right" skips the empty interval between them.
     edges = np.concatenate([[0.0], np.cumsum(weights, dtype=np.float64)])
     low, high = edges[first], edges[stop]
     position = np.searchsorted(edges, low + random.astype(np.float64) / 2**32 * (high - low), side="right") - 1
@@ -187,7 +187,7 @@ def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
 
 
 def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first episode and the end (exclusive) of a range of episodes in every history, two int64 (H,).
+    """Return the first episode and the end (exclusive) of a range of episodes in every history, int64 (H,) each.
 
     `counts` has the number of episodes of each history.
 
@@ -201,7 +201,7 @@ def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[n
             raise TypeError
         first, stop = episodes
         bounds = slice(first, stop)
-        # Most histories have equally many episodes, so the Python loop is short.
+        # Histories have few different numbers of episodes, so the Python loop is short.
         distinct, number = np.unique(counts, return_inverse=True)
         first, stop = np.array([bounds.indices(count)[:2] for count in distinct.tolist()], np.int64)[number].T
     except (TypeError, ValueError) as error:

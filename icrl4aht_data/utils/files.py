@@ -97,7 +97,7 @@ def parse_json(text: str) -> Any:
     """
     try:
         value = json.loads(text)
-    except (ValueError, RecursionError) as error:  # `json` raises these also for too many digits or levels
+    except (ValueError, RecursionError) as error:  # also raised for too many digits or levels
         raise IndexFormatError(f"not JSON: {error}") from error
     level = [value]
     for _ in range(_DEPTH):
@@ -119,7 +119,7 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def checked_hash(path: Path) -> str:
+def size_checked_hash(path: Path) -> str:
     """Return the SHA-256 of a file of at most `LARGEST` bytes as hexadecimal digits.
 
     Raises:
@@ -130,7 +130,7 @@ def checked_hash(path: Path) -> str:
         return file_hash(path)
 
 
-def have_hashes(folder: Path, files: Mapping[str, str]) -> bool:
+def hashes_match(folder: Path, files: Mapping[str, str]) -> bool:
     """Return whether the listed files of a folder have the listed SHA-256 hashes.
 
     Args:
@@ -232,7 +232,8 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
         names: names of the files to write into the folder.
 
     Raises:
-        OptionError: if a file exists without `overwrite`, or if there is a folder or link at its path.
+        OptionError: if a file exists or the folder is not empty, and `overwrite` is False; or if a folder or link has
+            the path of a file.
     """
     if names is not None and os.path.lexists(path):
         if not path.is_dir():
@@ -292,7 +293,7 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
                 path.unlink()
 
 
-def lock_path(folder: Path) -> Path:
+def lock_file_path(folder: Path) -> Path:
     """Return the path of a folder's lock file, which is next to the folder, so that a locked folder can be renamed."""
     return folder.with_name(f".{folder.name}.lock")
 
@@ -337,12 +338,15 @@ def resolve_inside(folder: Path, name: str) -> Path:
     In the cache of the Hugging Face Hub, links from a snapshot folder to the folder of blobs are allowed.
 
     Raises:
-        UnsafePathError: if the path points outside the release, or to neither a file nor a folder.
+        UnsafePathError: if `name` is not a safe path (see `is_safe_path`), or points outside the release, or to neither
+            a file nor a folder.
         IndexFormatError: if a folder on the path cannot be read.
     """
     path = folder / name
     if not is_safe_path(name):
-        raise UnsafePathError(f"{folder}: {name[:200]!r} points outside the release; do not use this release")
+        raise UnsafePathError(
+            f"{folder}: {name[:200]!r} points outside the release or is not a valid path; do not use this release"
+        )
     allowed = [folder.resolve()]
     if folder.parent.name == "snapshots" and (folder.parent.parent / "blobs").is_dir():
         allowed.append((folder.parent.parent / "blobs").resolve())

@@ -64,7 +64,7 @@ def import_optional(module: str, purpose: str) -> Any:
         raise OptionError(f"{purpose} needs {module.partition('.')[0]}: {install_command(_extra(module))}") from error
 
 
-def missing_library(module: str) -> str | None:
+def missing_library_message(module: str) -> str | None:
     """Return a message that says how to install a missing module; None if no extra installs it."""
     extra = _extra(module)
     top = module.partition(".")[0]

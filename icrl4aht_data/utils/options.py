@@ -56,7 +56,7 @@ class Option(NamedTuple):
 
 @cache
 def _hints_with(kind: type, *parts: Any) -> dict[str, Any]:
-    """Return the annotations of a dataclass that contain one of the given types, such as `Option`, by field name."""
+    """Return, by field name, the annotations in a dataclass that have a part of one of the given types."""
     hints = get_type_hints(kind, include_extras=True)
     return {
         name: hint
@@ -66,7 +66,7 @@ def _hints_with(kind: type, *parts: Any) -> dict[str, Any]:
 
 
 def option_hints(kind: type) -> dict[str, Any]:
-    """Return the annotations of a dataclass that contain an `Option`, by field name."""
+    """Return, by field name, the annotations in a dataclass that have an `Option` as a part."""
     return _hints_with(kind, Option)
 
 

@@ -28,10 +28,10 @@ from icrl4aht_data.benchmark.facts import (
     SPLITS,
     TESTED_ON,
     TRACKS,
-    family_order,
-    track_of,
+    family_sort_key,
+    layout_track,
 )
-from icrl4aht_data.benchmark.reference_returns import cells_without_headroom, read_headroom
+from icrl4aht_data.benchmark.reference_returns import cells_without_headroom, read_reference_returns
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import ReleaseInfo
@@ -127,7 +127,7 @@ def benchmark_test_layouts(layouts: Iterable[str]) -> list[str]:
     """Return the benchmark's test layouts for models that were trained on `layouts`."""
     names, tested = list(layouts), list[str]()
     for track, splits in TRACKS.items():
-        own = [name for name in names if track_of(name) == track]
+        own = [name for name in names if layout_track(name) == track]
         tested += [name for name in own if name in splits["test"]] or (list(splits["test"]) if own else [])
     return tested
 
@@ -203,7 +203,9 @@ def card_facts(root: Path) -> dict[str, Any]:
         "left_out": [asdict(task) for task in info.left_out],
         "headroom": headroom,
         "proof": read_proof(root),
-        "flat_cells": ["/".join(cell) for cell in cells_without_headroom(read_headroom(HEADROOM_PROTOCOL), tested)],
+        "flat_cells": [
+            "/".join(cell) for cell in cells_without_headroom(read_reference_returns(HEADROOM_PROTOCOL), tested)
+        ],
         "arrays": [name for name, array in FIELDS.items() if info.kind not in array.absent or name == "obs"],
         **_known_families(tasks),
         "suites": _distinct_values(tasks, "suite"),
@@ -228,7 +230,7 @@ def _range_text(values: Iterable[float]) -> str:
 
 
 def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return configuration -> split -> pattern of file names, for the dataset viewer of the Hugging Face Hub."""
+    """Return patterns of file names by configuration and split, for the dataset viewer of the Hugging Face Hub."""
     patterns = {"default": f"{PARQUET_INDEX}/*/{{}}.parquet"}
     patterns |= {entry.layout: f"{PARQUET_INDEX}/{entry.layout}/{{}}.parquet" for entry in entries}
     patterns |= {PARQUET_EPISODES: f"{PARQUET_EPISODES}/*/{{}}-*.parquet"}
@@ -241,7 +243,7 @@ def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str,
 
 
 def _learning_rows(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return a row with first and last returns for each layout title, source and split, sorted in this order."""
+    """Return rows with mean first and last returns: one for each layout title, source and split, in this order."""
     names = ("layout", "source", "split")
     order = [*titles, *SOURCES, *(task.first.source for task in tasks), *SPLITS]  # sources not in SOURCES come last
     ordered = sorted(tasks, key=lambda task: [order.index(getattr(task.first, name)) for name in names])
@@ -295,13 +297,13 @@ def _teammate_rows(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[
 
     def sort_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
         family = row["family"]
-        return order[row["layout"]], order[row["split"]], family == "rl", family_order(family)
+        return order[row["layout"]], order[row["split"]], family == "rl", family_sort_key(family)
 
     return sorted(rows, key=sort_key)
 
 
 def _behaviour_counts(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the numbers of teammates with known behaviour and of distinct behaviours, by split."""
+    """Count teammates with known behaviour and distinct behaviours by split, and behaviours that both splits share."""
     known = [row for row in teammates if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None]
     found = {
         split: [(row["layout"], row["family"], row["nearest_test"]["behaviour"]) for row in own]
@@ -319,7 +321,7 @@ def _layout_rows(
     Args:
         info: info of the release, with a summary of each layout.
         titles: titles of the layouts by name, see `layout_title`.
-        matters: `ReferenceEgos.egos_differ` of each teammate, by layout title.
+        matters: values of `ReferenceEgos.egos_differ` of the compared teammates, by layout title.
     """
     rows = []
     for title in dict.fromkeys(titles.values()):
@@ -341,7 +343,7 @@ def _layout_rows(
 
 
 def _known_families(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
-    """Return the families of heuristic training and validation teammates, by their similarity to test teammates.
+    """Return how similar heuristic training and validation teammates are to test teammates.
 
     Returns:
         `tested`: families with a teammate that behaves the same as a test teammate of its family, or that was not
@@ -388,12 +390,12 @@ def _teammate_kind(task: Task) -> str:
 
 
 def _kind_rows(tasks: Iterable[_TaskFacts], layouts: Iterable[str]) -> list[list[str]]:
-    """Return the rows of the card's table of teammates by kind, which also shows missing kinds.
+    """Return the rows of the card's table of teammates by kind, including kinds without teammates.
 
-    The columns are the kind, the numbers of different teammates of this kind in training and in validation, on the
-    benchmark's training layouts and on other layouts, and the training layouts that have no training teammate of this
-    kind. A teammate that never acts, or that mixes in random actions, does not count as a member of its family. There
-    are no rows if the release has no tasks.
+    The columns are the kind; the numbers of different teammates of the kind on the benchmark's training layouts (in
+    training, in validation) and on other layouts (the same); and the benchmark's training layouts without a training
+    teammate of the kind. A teammate that never acts, or that mixes in random actions, does not count as a member of its
+    family. There are no rows if the release has no tasks.
     """
     published = [name for name in layouts if name in TESTED_ON]
     found = defaultdict[tuple[str, str, bool], set[tuple[str, str]]](set)
@@ -440,7 +442,7 @@ def _generation_facts(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
     }
 
 
-def print_learning(content: Mapping[str, Any], console: Console) -> None:
+def print_learning_curves(content: Mapping[str, Any], console: Console) -> None:
     """Print a dataset card's table of learning curves, and the tasks that were left out of the release.
 
     Args:

@@ -1,8 +1,9 @@
 """Conversion of histories to a Minari dataset.
 
-The Minari dataset has one Minari episode per episode of the selection, in order, with the observations of the n stored
-steps and of the state after the last one, the ego's actions, and the rewards. Episodes never terminate, but are
-truncated after the last stored step. `infos` has arrays of n + 1 rows, one for each observation:
+The Minari dataset has one Minari episode per episode of the selection, in order. An episode of n stored steps has n
+actions of the ego, n rewards, and n + 1 observations; the last observation shows the state after the last step.
+Episodes never terminate, but are truncated after the last stored step. `infos` has arrays of n + 1 rows, one for each
+observation:
 
     state            uint8 (n + 1, S), state record, see `icrl4aht_data.overcooked.state`
     teammate_action  int8 (n + 1,), the teammate's action that led to the observation; -1 in the first row
@@ -110,7 +111,7 @@ def to_minari(
 def _metadata(dataset: Dataset) -> dict[str, Any]:
     """Return the content of the metadata key `icrl4aht`."""
     first = {entry.task_id: entry for entry in dataset.entries}
-    names = ("task_id", "source", "env_idx", "learner", "episodes")  # the teammates are in `provenance`
+    names = ("task_id", "source", "env_idx", "learner", "episodes")  # `provenance` has swapped teammates
     return {
         "data_version": dataset.info.data_version,
         "kept_steps": dataset.info.environment.kept_steps,

@@ -36,7 +36,7 @@ def read_proof(root: Path) -> dict[str, Any] | None:
 
 
 def proof_table(proof: Mapping[str, Any]) -> str:
-    """Return a Markdown table of the models' mean returns, with the histories used and the range over training runs."""
+    """Return a Markdown table of models, their training histories, and their mean returns (range over runs)."""
     rows = [
         [one["histories"], one["learner"], str(len(one["seeds"])), *(_mean_text(one[key], key) for key in _COLUMNS)]
         for one in proof["models"]

@@ -84,7 +84,7 @@ def to_published(
             for number, history in enumerate(dataset):
                 group = new.create_group(f"/{number}")
                 for field in (one for one in history.entry.stored_fields(kind) if one.name != "oracle_actions"):
-                    _write_published(group, field.name, history.read(field.name), chunk)
+                    _write_published_array(group, field.name, history.read(field.name), chunk)
                 line = history.entry.to_json() | {"history_id": number, "h5_group": f"/{number}"}
                 line["env_idx"] += history.entry.learner * _streams_per_learner(provenance.get(history.entry.task_id))
                 index.write(json.dumps({name: line[name] for name in PUBLISHED_FIELDS}) + "\n")
@@ -133,7 +133,7 @@ def _new_hdf5(path: Path) -> Iterator[h5py.File]:
 
 
 def _streams_per_learner(provenance: Provenance | None) -> int:
-    """Return how many values of `env_idx` the published index reserves for each learner of a task.
+    """Return the number of `env_idx` values that `to_published` reserves for each learner of a task.
 
     This is the number of environments in the ego's training, or 2**31 if the provenance does not record an ego.
     """
@@ -141,7 +141,7 @@ def _streams_per_learner(provenance: Provenance | None) -> int:
     return 2**31 if ego is None else ego["environments"]
 
 
-def _write_published(group: h5py.Group, name: str, array: np.ndarray, chunk: int) -> None:
+def _write_published_array(group: h5py.Group, name: str, array: np.ndarray, chunk: int) -> None:
     if name in ACTION_FIELDS:
         array = _TO_PUBLISHED[array]
     elif name == "obs":
@@ -306,7 +306,10 @@ class _PublishedHistory:
         return [f.name for f in fields if self.kind not in f.optional or self.line.get(f"has_{f.name}")]
 
     def check_arrays(self, present: set[str]) -> None:
-        """Check that `present`, the names of the arrays in the group, has `obs` and all arrays to convert.
+        """Check that the history's group has `obs` and all arrays to convert.
+
+        Args:
+            present: names of the arrays in the group.
 
         Raises:
             PublishedFormatError: if arrays are missing; the message has the group and the names of the arrays.
@@ -319,13 +322,13 @@ class _PublishedHistory:
             )
 
     def read(self, name: str) -> np.ndarray:
-        """Return one array with the dtype of `Field.compact` and the shape (T, ...), or (E, S) for `episode_end_state`.
+        """Return one array in its field's compact dtype, of shape (T, ...); `episode_end_state` has the shape (E, S).
 
         Raises:
-            PublishedFormatError: if the array is invalid; the message has its name, and what was expected and found.
+            PublishedFormatError: if the array is invalid; the message has its name and the expected and found values.
         """
         layout, steps = get_layout(self.line["layout"]), self.line["T"]
-        if name == "obs" and self.needs_padding and self.kind != OBSERVATIONS:  # rendered from states, without padding
+        if name == "obs" and self.needs_padding and self.kind != OBSERVATIONS:  # states show all cells, so no padding
             return fast_observe(layout, self.read("state"), np.empty((steps, *layout.obs_shape), np.uint8))
         array = self._read_recorded(name)
         if name == "obs" and self.needs_padding:

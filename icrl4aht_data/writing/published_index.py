@@ -64,7 +64,7 @@ def read_published_index(path: Path) -> list[dict[str, Any]]:
                 ((line["task_id"], line["env_idx"]), f"stream {line['env_idx']} of task {line['task_id']!r}"),
             ):
                 if (first := seen.setdefault(key, number)) != number:
-                    raise PublishedFormatError(f"{what} is already used by line {first}; each history needs its own")
+                    raise PublishedFormatError(f"{what} is already used by line {first}; change one of the lines")
         except (msgspec.ValidationError, Icrl4ahtError) as error:
             raise PublishedFormatError(f"{path}, line {number}: {error}") from error
         lines.append(line)

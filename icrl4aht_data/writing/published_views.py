@@ -29,8 +29,8 @@ def has_missing_rows(layout: Layout, obs_shape: tuple[int, ...]) -> bool:
     return layout.height < WINDOW and tuple(obs_shape) == (layout.height, *layout.obs_shape[1:])
 
 
-def empty_views(layout: Layout) -> np.ndarray:
-    """Return the observation of a map without items from each cell that the ego can reach, uint8 (cells, 5, 5, C)."""
+def views_without_items(layout: Layout) -> np.ndarray:
+    """Return observations without items from each cell that the ego can reach, uint8 of shape (cells, 5, 5, C)."""
     records = np.zeros((len(layout.rooms[EGO]), record_size(layout)), np.uint8)
     records[:, columns(layout).positions] = layout.rooms[EGO][:, None]
     return np.asarray(observe(layout, records, EGO))
@@ -41,16 +41,16 @@ def complete_views(layout: Layout, short: np.ndarray) -> np.ndarray:
 
     Args:
         layout: the layout.
-        short: uint8 (T, H, 5, C), observations with the H rows of the map; the ego is in the third row.
+        short: observations with the H rows of the map, uint8 of shape (T, H, 5, C); the ego is in the third row.
 
     Returns:
-        Padded observations uint8 (T, 5, 5, C).
+        Padded observations, uint8 of shape (T, 5, 5, C).
 
     Raises:
         PublishedFormatError: if an observation does not match the layout from any cell that the ego can reach; the
             caller adds the file and the group to the message.
     """
-    rows, fixed, known = short.shape[1], fixed_channels(layout), empty_views(layout)
+    rows, fixed, known = short.shape[1], fixed_channels(layout), views_without_items(layout)
     cells = {view[:rows, :, fixed].tobytes(): cell for cell, view in enumerate(known)}
     at = np.array([cells.get(view.tobytes(), -1) for view in np.ascontiguousarray(short[..., fixed])], np.int64)
     if (at < 0).any():

@@ -14,7 +14,7 @@ from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.fetch import is_address
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import MANIFEST
-from icrl4aht_data.utils.files import explain_full_disk, files_below, lock_path, process_lock
+from icrl4aht_data.utils.files import explain_full_disk, files_below, lock_file_path, process_lock
 
 HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
 """Names of the two main files of the published format."""
@@ -57,15 +57,15 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
     with explain_full_disk(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with process_lock(lock_path(target), wait=False):
-                if old.exists() and not target.exists():  # a run was killed in `_replace`
+            with process_lock(lock_file_path(target), wait=False):
+                if old.exists() and not target.exists():  # a run was killed between the two steps of `_replace`
                     old.rename(target)
                     check_target(target, overwrite, sources)
                 for leftover in (new, old):
                     shutil.rmtree(leftover, ignore_errors=True)
                 try:
                     new.mkdir()
-                    with explain_full_disk(target):  # the error states the free space before `new` is removed
+                    with explain_full_disk(target):  # measure the free space before `new` is removed
                         yield new
                     check_target(target, overwrite, sources)
                     _replace(target, new, old)
@@ -79,7 +79,7 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
 
 
 def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = ()) -> bool:
-    """Check that a folder may be written: it must be missing or empty, or may be replaced.
+    """Check that a folder may be written, that is, that the folder is missing, empty, or may be replaced.
 
     Args:
         target: the folder to write.

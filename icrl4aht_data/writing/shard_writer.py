@@ -68,7 +68,7 @@ def write_shard(
             _create_datasets(file, layout, kind, [entry for entry in entries if entry.h5_group == group])
         open_dataset = cache(lambda name: file[name])  # opening a dataset takes as long as writing a chunk
         for entry, chunks in zip(entries, histories, strict=True):
-            for field, start, data in sorted(chunks, key=lambda chunk: file_order(chunk.field, chunk.start)):
+            for field, start, data in sorted(chunks, key=lambda chunk: chunk_sort_key(chunk.field, chunk.start)):
                 position = (start,) if entry.h5_row is None else (entry.h5_row, start)
                 open_dataset(f"{entry.h5_group}/{field.name}").id.write_direct_chunk(position, data)
         locations = [row for entry in entries for row in chunk_locations(file, kind, entry)]
@@ -78,13 +78,13 @@ def write_shard(
         file.flush()
         content: bytes = file.id.get_file_image()
     saved = BytesIO()
-    np.save(saved, np.concatenate([table, metadata_lines(content, table)]), allow_pickle=False)
+    np.save(saved, np.concatenate([table, metadata_rows(content, table)]), allow_pickle=False)
     for name, data in ((path, content), (table_path, saved.getbuffer())):
         with add_filename(name):
             name.write_bytes(data)
 
 
-def metadata_lines(content: bytes, chunks: np.ndarray) -> np.ndarray:
+def metadata_rows(content: bytes, chunks: np.ndarray) -> np.ndarray:
     """Return the rows of a chunk table for the HDF5 metadata of a shard, that is, for the bytes between the chunks."""
     ordered = np.sort(chunks, order="offset")
     starts = [*ordered["offset"].tolist(), len(content)]
@@ -122,7 +122,7 @@ def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Seque
         )
 
 
-def file_order(field: Field, start: int) -> tuple[int, ...]:
+def chunk_sort_key(field: Field, start: int) -> tuple[int, ...]:
     """Return a sort key that orders a history's chunks so that a window of steps is one byte range of the file.
 
     Chunks are sorted by block of `_BLOCK` steps, then by field. In a block, the scalars that every window needs are

@@ -1,4 +1,4 @@
-"""Test the JAX environment: episode starts and ends, random keys, recipes, and rules equal to NumPy's."""
+"""Test the JAX environment: episode starts and ends, random keys, recipes, and agreement with the NumPy rules."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def test_raw_random_keys_give_the_results_of_typed_keys(cramped, keys):
 
 
 def recipe_transitions(compiled: CompiledEnv, seed: int, deliveries: int) -> np.ndarray:
-    """Deliver in every step; return recipes before and after each correct delivery, shape (deliveries * N, 2)."""
+    """Deliver in every step; return recipes before and after each correct delivery, of shape (deliveries * N, 2)."""
     state, pairs = compiled.init(some_keys(seed)), []
     for _ in range(deliveries):
         state = move_to_goal(state)

@@ -13,7 +13,7 @@ from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.cells import BUTTON, POT, WALL
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
 from icrl4aht_data.overcooked.observe import observe_both
-from icrl4aht_data.overcooked.state import columns, padded_positions
+from icrl4aht_data.overcooked.state import columns, padded_columns
 from icrl4aht_data.overcooked.tables import make_tables, stack_tables
 
 NAMES = ("cramped_up", "coord_ring", "test_wide", "demo_wide")
@@ -25,7 +25,7 @@ ENVS, STEPS = 3 * len(NAMES), 30
 
 @pytest.fixture(scope="module")
 def recorded_steps() -> dict[str, np.ndarray]:
-    """Play two episodes of random actions; return arrays (steps, environments, ...) by name."""
+    """Play two episodes of random actions; return arrays of shape (steps, environments, ...) by name."""
     env = Environment(GROUP, max_steps=STEPS)
 
     def step(state, key):
@@ -45,25 +45,25 @@ def recorded_steps() -> dict[str, np.ndarray]:
         return after.state, shown
 
     run = jax.jit(lambda keys, steps: jax.lax.scan(step, env.init(keys), steps)[1])
-    found = run(keys_of(ENVS), jax.random.split(jax.random.key(1), 2 * STEPS))
+    found = run(random_keys(ENVS), jax.random.split(jax.random.key(1), 2 * STEPS))
     return {name: np.asarray(value) for name, value in found.items()}
 
 
-def keys_of(count: int) -> jax.Array:
+def random_keys(count: int) -> jax.Array:
     return jax.random.split(jax.random.key(0), count)
 
 
 @pytest.mark.parametrize("number", range(len(NAMES)), ids=NAMES)
-def test_each_of_several_layouts_gives_the_results_of_this_layout_alone(recorded_steps, number):
+def test_environment_with_several_layouts_equals_one_environment_per_layout(recorded_steps, number):
     layout, envs = GROUP[number], np.arange(number, ENVS, len(NAMES))
-    own = padded_positions(layout, stack_tables(GROUP))
+    own = padded_columns(layout, stack_tables(GROUP))
     part = {name: value[:, envs] for name, value in recorded_steps.items()}
     assert (part["layout"] == number).all()
     records, final = part["record"][..., own], part["final"][..., own]
     others = np.setdiff1d(np.arange(part["record"].shape[-1]), own)
     assert not part["record"][..., others].any()  # padded pots and counters stay empty
     for episode in (0, STEPS):
-        start = Environment(layout, STEPS).first_record(keys_of(ENVS)[envs], jnp.full(len(envs), episode // STEPS))
+        start = Environment(layout, STEPS).first_record(random_keys(ENVS)[envs], jnp.full(len(envs), episode // STEPS))
         np.testing.assert_array_equal(records[episode], start)
     alone = rules.step(layout, records, part["actions"], part["next_recipe"])
     np.testing.assert_array_equal(final, alone.state)
@@ -77,7 +77,7 @@ def test_each_of_several_layouts_gives_the_results_of_this_layout_alone(recorded
 def test_layouts_are_drawn_uniformly_at_each_reset():
     env = Environment(GROUP, max_steps=1, redraws=True)
     step = jax.jit(lambda state: env.step(state, jnp.full((ENVS, 2), 4)).state)
-    states = [jax.jit(env.init)(keys_of(ENVS))]
+    states = [jax.jit(env.init)(random_keys(ENVS))]
     for _ in range(30):
         states.append(step(states[-1]))
     numbers = np.array([state.layout for state in states])
@@ -115,6 +115,6 @@ def test_layouts_that_cannot_be_stacked_raise_errors():
 
 def test_initial_layouts_can_be_chosen_by_number():
     env = Environment(GROUP, max_steps=STEPS)
-    state = jax.jit(env.init)(keys_of(2), jnp.array([3, 1]))
+    state = jax.jit(env.init)(random_keys(2), jnp.array([3, 1]))
     assert state.layout is not None and state.layout.tolist() == [3, 1]
     assert all(GROUP[number].walkable[cells].all() for number, cells in zip([3, 1], state.record[:, :2], strict=True))

@@ -1,4 +1,4 @@
-"""Test tables of shortest paths against a brute-force search."""
+"""Test tables of shortest paths against the Floyd-Warshall algorithm."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def reference_move(layout: Layout, cell: int, action: int) -> int:
 
 @lru_cache
 def reference_distances(layout: Layout) -> np.ndarray:
-    """Return the numbers of steps between floor cells, int (cells, cells), by the Floyd-Warshall algorithm."""
+    """Return the numbers of steps between floor cells by the Floyd-Warshall algorithm, int of shape (cells, cells)."""
     distance = np.full((layout.cells, layout.cells), NOWHERE)
     for cell, letter in enumerate("".join(layout.rows)):
         if letter in " A":
@@ -50,7 +50,7 @@ def reference_first_step(layout: Layout, origin: int, target: int) -> int:
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_path_tables_equal_brute_force_search(name):
+def test_path_tables_equal_the_floyd_warshall_algorithm(name):
     layout = LAYOUTS[name]
     tables = layout.tables
     np.testing.assert_array_equal(tables.distance, reference_distances(layout))

@@ -95,7 +95,7 @@ def test_artefact_settings_depend_on_task_learner_and_ego_only(changed):
     assert settings(plain) != settings(load_profile(changed("dense = 8", "dense = 9")))
     assert settings(plain) != settings(plain, learner=1)
     other = load_profile(changed("[release]", "[ego.layouts.coord_simple]\nentropy = 0.02\n[release]"))
-    assert (other.ego_on("coord_simple").entropy, other.ego_on("cramped_up").entropy) == (0.02, 0.01)
+    assert (other.ego_config("coord_simple").entropy, other.ego_config("cramped_up").entropy) == (0.02, 0.01)
     assert settings(other) == settings(plain)
     assert artefact_settings(other.units()[0], other) != artefact_settings(plain.units()[0], plain)
 
@@ -210,7 +210,7 @@ def test_profile_overrides_settings_of_its_base(tmp_path):
     path.write_text('base = "search"\n[search]\nepisodes = 12\n[search.layouts.asymm_both_plain]\nhistories = 3\n')
     mine, base = load_profile(str(path)), load_profile("search")
     assert mine.search == replace(base.search, episodes=12)
-    assert mine.scripted_on("asymm_both_plain", "search") == replace(base.search, episodes=12, histories=3)
+    assert mine.scripted_config("asymm_both_plain", "search") == replace(base.search, episodes=12, histories=3)
     assert mine.units() == base.units()
     path.write_text('base = "serach"\n')
     with pytest.raises(OptionError, match=r"mine.toml: unknown base 'serach'.*Did you mean 'search'"):

@@ -20,7 +20,10 @@ def embedded_data(html: bytes) -> tuple[dict[str, Any], list[bytes]]:
 
 
 def embedded_episodes(index: dict[str, Any], facts: dict[str, Any], content: bytes) -> dict[int, dict[str, np.ndarray]]:
-    """Return episode number -> column name -> values of the column; the column "state" is uint8 (frames, S)."""
+    """Return the columns of each embedded episode, as episode number -> column name -> values.
+
+    The column "state" is uint8 of shape (frames, S).
+    """
     size, names = index["layouts"][facts["layout"]]["record_size"], facts["columns"]
     columns = np.frombuffer(content, np.uint8).reshape(size + len(names), sum(facts["frames"]))
     named = {"state": columns[:size].T, **dict(zip(names, columns[size:], strict=True))}

@@ -12,9 +12,9 @@ from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from icrl4aht_baselines.evaluate.results import Result, write_result
 from icrl4aht_baselines.report.results import EvaluationRun, as_run
 
-from icrl4aht_data.benchmark.best_responses import BestResponse, BestResponseCard, TrainedResponse, write_best_responses
+from icrl4aht_data.benchmark.best_responses import BestResponse, BestResponseCard, TrainingRun, write_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, read_headroom, stay_returns
+from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, read_reference_returns, stay_returns
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 
 TEST_TASKS = [task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))]
@@ -61,12 +61,12 @@ SPAN = 20.0
 
 def write_invented_responses(path: Path) -> Path:
     """Write invented best responses to all teammates of test tasks; a layout's five H4 teammates share a response."""
-    stays, headroom, behaviours = stay_returns("seeded"), read_headroom("seeded"), []
+    stays, headroom, behaviours = stay_returns("seeded"), read_reference_returns("seeded"), []
     for (layout, family), egos in headroom.items():
         tasks = [task for task in TEST_TASKS if (task.layout.name, task.teammate_family) == (layout, family)]
         for own in [tasks] if family == "H4" else [[task] for task in tasks]:
             best = float(np.mean([stays[task.task_id] for task in own])) + SPAN * has_headroom(egos)
-            ids, trained = tuple(task.task_id for task in own), (TrainedResponse(1, 10, best),)
+            ids, trained = tuple(task.task_id for task in own), (TrainingRun(1, 10, best),)
             behaviours.append(BestResponse(layout, family, "test", ids, trained, best, "best response, seed 1"))
     write_best_responses(path, BestResponseCard("7", "seeded", "Invented.", tuple(behaviours)))
     return path

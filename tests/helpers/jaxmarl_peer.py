@@ -34,7 +34,7 @@ def to_our_item(layout: Layout, code: np.ndarray) -> np.ndarray:
 
 
 def to_jaxmarl_state(layout: Layout, env: OvercookedV2, records: np.ndarray) -> JaxmarlState:
-    """Convert state records uint8 (B, S) to JaxMARL's batched state."""
+    """Convert state records, uint8 of shape (B, S), to JaxMARL's batched state."""
     ours = unpack(layout, records)
     batch, shape = len(records), (layout.height, layout.width)
     grid = np.zeros((batch, layout.cells, 3), np.int32)
@@ -59,7 +59,7 @@ def to_jaxmarl_state(layout: Layout, env: OvercookedV2, records: np.ndarray) -> 
 
 
 def from_jaxmarl_state(layout: Layout, state: JaxmarlState) -> np.ndarray:
-    """Convert JaxMARL's batched state to records uint8 (B, S), without using this package's function `pack`."""
+    """Convert JaxMARL's batched state to records, uint8 of shape (B, S), without this package's function `pack`."""
     position = np.asarray(state.agents.pos.y) * layout.width + np.asarray(state.agents.pos.x)
     grid = np.asarray(state.grid).reshape(len(position), layout.cells, 3)
     columns = [
@@ -77,7 +77,10 @@ def from_jaxmarl_state(layout: Layout, state: JaxmarlState) -> np.ndarray:
 
 
 def jaxmarl_step(env: OvercookedV2):
-    """Return JaxMARL's step function, jitted and batched; it takes keys, states and actions (B, 2) in JaxMARL's ids."""
+    """Return JaxMARL's step function, jitted and batched.
+
+    The function takes keys, states, and actions of shape (B, 2), which are JaxMARL's ids.
+    """
 
     def single_step(key, state, actions):
         obs, state, reward, _, info = env.step_env(key, state, {"agent_0": actions[0], "agent_1": actions[1]})

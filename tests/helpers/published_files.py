@@ -22,7 +22,9 @@ _IDS = {name: number for number, name in enumerate(PUBLISHED_ACTIONS)}
 
 
 def write_published_files(folder: Path) -> list[dict[str, np.ndarray]]:
-    """Write `histories.h5` and its index, without states and tasks, and with an unfinished last episode.
+    """Write `histories.h5` and its index, without states and tasks.
+
+    The last episode is unfinished in two of the four histories.
 
     Returns:
         The arrays of each history; actions are indices into `ACTIONS`.

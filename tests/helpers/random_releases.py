@@ -13,14 +13,14 @@ import msgspec
 import numpy as np
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark.facts import TRACKS, track_of
+from icrl4aht_data.benchmark.facts import TRACKS, layout_track
 from icrl4aht_data.benchmark.tasks import Dish, Task, make_task
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSwaps
 from icrl4aht_data.format.schema import LAYOUTS_FILE, Entry, Kind
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.rules import step
-from icrl4aht_data.overcooked.state import start_record
+from icrl4aht_data.overcooked.state import initial_record
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
@@ -28,13 +28,13 @@ SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
 
 
 def random_history(layout: Layout, episodes: int, length: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Return the arrays of one history of random actions, 40% of them `interact`."""
+    """Return the arrays of one history of random actions; about half of the actions are `interact`."""
     rooms = layout.rooms
     positions = np.stack([rng.choice(room, episodes) for room in rooms], axis=1)
     clash = positions[:, 0] == positions[:, 1]
     positions[clash] = rooms[0][0], rooms[1][-1]
     facings = rng.integers(0, 4, (episodes, 2)).astype(np.uint8)
-    state = start_record(layout, positions, facings, rng.choice(layout.recipe_items, episodes))
+    state = initial_record(layout, positions, facings, rng.choice(layout.recipe_items, episodes))
     actions = np.where(rng.random((length, episodes, 2)) < 0.4, 5, rng.integers(0, 6, (length, episodes, 2)))
     states, rewards = [], []
     for row in actions:
@@ -60,8 +60,8 @@ def make_tasks(layouts: list[str], teammates: int = 1, recipes: Sequence[Dish] |
     """Return tasks with different heuristic teammates; the split is "train" on training layouts, "test" on others."""
     return [
         make_task(
-            track_of(layout),
-            "train" if layout in TRACKS[track_of(layout)]["train"] else "test",
+            layout_track(layout),
+            "train" if layout in TRACKS[layout_track(layout)]["train"] else "test",
             layout,
             {"kind": "heuristic", "family": "utility_greedy", "theta_id": t, "base_seed": 0, "theta": {"x": t}},
             seed,
@@ -95,7 +95,7 @@ def random_release(
 
     `experts` and `sources` say where each task's labels and histories come from; `oracle` adds oracle actions, equal to
     the labels if the source is "noise". Every learner has `streams` histories; a noise task has one learner. With
-    `swap`, the metadata say that the layout's teammates play in turn, each for this number of episodes.
+    `swap`, the metadata say that the layout's teammates play in turn, each for `swap` episodes.
     """
     rng = np.random.default_rng(seed)
     written: dict[int, dict[str, np.ndarray]] = {}

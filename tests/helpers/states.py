@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.state import (
 
 
 def random_records(layout: Layout, size: int, rng: np.random.Generator) -> np.ndarray:
-    """Return random valid state records uint8 (size, S); most have items in hands, in pots and on counters."""
+    """Return random valid records, uint8 of shape (size, S); most have items in hands, in pots and on counters."""
     items = possible_items(layout).nonzero()[0]
     counts = ingredient_count(items)
     in_pot = items[items & PLATE == 0]
@@ -65,10 +65,10 @@ def _fullness_weights(counts: np.ndarray) -> np.ndarray:
 
 
 def state_record(layout: Layout, ego: tuple[int, int, str], teammate: tuple[int, int, str], **fields) -> np.ndarray:
-    """Return a state record uint8 (1, S) with agents at (x, y, facing) and the given fields; other fields are empty.
+    """Return a state record, uint8 of shape (1, S), with agents at (x, y, facing) and the given fields.
 
     Fields are hands=(ego's item, teammate's item), recipe, delivered, the sequences pot_items, pot_timers and buttons,
-    and counters={(x, y): item}.
+    and counters={(x, y): item}. Other fields are empty, but the default recipe is the first one.
     """
     record = np.zeros((1, record_size(layout)), np.uint8)
     where = columns(layout)

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, SOURCES, track_of
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, SOURCES, layout_track
 from icrl4aht_data.benchmark.tasks import Task, make_task
-from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos
+from icrl4aht_data.format.provenance import ExpertLabels, NearestTestTeammate, Provenance, ReferenceEgos
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.random_releases import random_history
@@ -76,11 +76,11 @@ def _tasks() -> Iterator[tuple[Task, str]]:
             "base_seed": int(split == "validation"),
             "theta": {"idle_prob": number / 64},
         }
-        yield make_task(track_of(layout), split, layout, teammate, seed=number), source
+        yield make_task(layout_track(layout), split, layout, teammate, seed=number), source
 
 
 def _oracle_actions(actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return labels; the probability that a label is the taken action rises from 0 to 1 over the episodes."""
+    """Return labels: random actions with a probability that falls from 1 to 0 over the episodes, else `actions`."""
     chance = np.repeat(np.linspace(1.0, 0.0, len(actions) // LENGTH), LENGTH)
     return np.where(rng.random(len(actions)) < chance, rng.integers(0, 6, len(actions)), actions)
 
@@ -95,7 +95,7 @@ def _provenance(task: Task, source: str, histories: int) -> Provenance:
         learners=None if script else 2,
         noise=NOISE if script else None,
         references=ReferenceEgos(stay=0.0, random=0.5, oracle=5.0, episodes=20),
-        nearest_test=NearestTest(f"{family}/t1", 0.25, behaviour=task.teammate["theta_id"]),
+        nearest_test=NearestTestTeammate(f"{family}/t1", 0.25, behaviour=task.teammate["theta_id"]),
         streams_recorded=histories,
         streams_kept=histories,
         expert=labels if script else None,

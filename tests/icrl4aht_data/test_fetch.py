@@ -93,7 +93,7 @@ def shard_names(folder: Path) -> set[str]:
 # Tests of reading remote releases
 
 
-def test_remote_release_of_an_older_version_with_a_source_card_file_can_be_opened(lite, tmp_path):
+def test_older_remote_releases_that_contain_source_card_md_can_be_opened(lite, tmp_path):
     shutil.copytree(lite[0], tmp_path / "served")
     (tmp_path / "served" / "meta" / "source_card.md").write_text("# card\n")
     write_manifest(tmp_path / "served")

@@ -33,7 +33,12 @@ from icrl4aht_data.benchmark.facts import (
     SAME_BEHAVIOUR,
     TRACKS,
 )
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, read_headroom, same_behaviour_tasks
+from icrl4aht_data.benchmark.reference_returns import (
+    HEURISTICS,
+    has_headroom,
+    read_reference_returns,
+    same_behaviour_tasks,
+)
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.index import read_index
@@ -57,13 +62,13 @@ def bundled_entries() -> tuple[Entry, ...]:
     return tuple(read_index(MINI).entries)
 
 
-def count_rising_entries() -> tuple[float, ...]:
+def count_rising_returns() -> tuple[float, ...]:
     rising = [entry for entry in bundled_entries() if entry.return_end - entry.return_start >= LEAST_HEADROOM]
     return len(rising), len(bundled_entries()), LEAST_HEADROOM
 
 
 def count_cells_without_headroom() -> tuple[int, int]:
-    cells = read_headroom("published").values()
+    cells = read_reference_returns("published").values()
     return sum(not has_headroom(cell) for cell in cells), len(cells)
 
 
@@ -73,7 +78,7 @@ def bundled_tasks(split: str, kind: Literal["", "diverse"] = "") -> list[Task]:
 
 
 def paper_plan_sizes() -> tuple[float, ...]:
-    """Return the numbers of learners, environment steps, recorded and kept transitions in profile `paper`."""
+    """Return profile `paper`'s numbers of learners, environment steps, recorded transitions and kept transitions."""
     profile = load_profile("paper")
     ego, count = profile.ego, sum(profile.task_count(name, "ppo") for name in profile.layouts)
     steps = ego.episodes * KEPT_STEPS
@@ -97,9 +102,9 @@ def tiny_model_size() -> tuple[int, int, int]:
 
 
 def count_test_behaviours() -> tuple[int, ...]:
-    """Return the numbers of test behaviours and test tasks, then three counts of behaviours of a family on a layout.
+    """Return the numbers of test behaviours and test tasks, and three numbers of behaviours of a family on a layout.
 
-    The three counts are for H1 on cramped_down, for H2 on test_wide, and for every other pair except pairs with H4.
+    The last three are for H1 on cramped_down, for H2 on test_wide, and for every other pair without H4.
     """
     by_id = {task.task_id: task for task in bundled_tasks("test")}
     counts = Counter((task.layout.name, task.teammate_family) for task in by_id.values())
@@ -120,7 +125,7 @@ def bundled_release_size() -> tuple[int, ...]:
 
 
 CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
-    ("README", "return of {} of the {} bundled histories rises by at least {} from", count_rising_entries),
+    ("README", "return of {} of the {} bundled histories rises by at least {} from", count_rising_returns),
     ("README", "{} histories of {} tasks on {} layouts: {} steps in {} MB", bundled_release_size),
     ("README", "correct delivery is worth {}.", lambda: DELIVERY_REWARD),
     ("README", "more than `stay` in {} of the {} cells", count_cells_without_headroom),
@@ -185,7 +190,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
 
 
 def numbers_in_page(page: str, claim: str) -> list[str]:
-    """Return the numbers that a page has at each {} of a claim; the page must contain the claim exactly once."""
+    """Return the numbers that a page has in place of a claim's {}; the page must contain the claim exactly once."""
     pattern = r"\s+".join(re.escape(word).replace(r"\{\}", NUMBER) for word in claim.split())
     found = list(re.finditer(pattern, (ROOT / f"{page}.md").read_text(encoding="utf-8")))
     assert len(found) == 1, f"{page}.md has {claim!r} {len(found)} times"

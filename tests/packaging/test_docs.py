@@ -53,9 +53,9 @@ COMPILING = ("adapters", "evaluating", "protocol")
 
 
 def run_snippets(page: str, folder: Path) -> dict[str, Any]:
-    """Run a page's snippets in order in a folder with the package's data; return the names that snippets define.
+    """Run a page's snippets in order in a folder with a link to the package; return the variables of the snippets.
 
-    Each snippet must print exactly the text block after the snippet, where "..." stands for the package's folder.
+    Each snippet must print exactly the text block after the snippet, where "..." stands for the repository's path.
     Line numbers in tracebacks count the lines of the page.
     """
     names: dict[str, Any] = {}

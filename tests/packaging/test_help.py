@@ -24,7 +24,7 @@ RESEARCH = "draws manifests diversity reference headroom proof"
 
 
 def find_command(verb: Verb) -> click.Command:
-    """Return the click command that runs when the program gets the words of `verb.name`."""
+    """Return the click command of a verb, found by the words of the verb's name, such as "release build"."""
     command: click.Command | None = cli
     for word in verb.name.split():
         assert isinstance(command, VerbGroup)
@@ -51,7 +51,7 @@ def test_every_command_has_complete_help(words):
 
 
 def test_help_of_the_program_imports_no_command():
-    """If no commands and no JAX are imported, help takes less than 0.5 s of CPU time, mostly for NumPy."""
+    """Help takes less than 0.5 s of CPU time, mostly for NumPy, because it imports neither commands nor JAX."""
     code = "import sys; from icrl4aht_data.commands.cli import cli; cli(['--help'], standalone_mode=False); "
     code += "print('loaded:', *sys.modules)"
     text, _, loaded = run_python("-c", code).partition("loaded: ")

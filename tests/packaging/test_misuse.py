@@ -1,4 +1,4 @@
-"""Test that bad input on the command line gives an exit code and one message that names fault and remedy."""
+"""Test that bad input on the command line gives an exit code and one message that names the fault and the remedy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.helpers.paths import ROOT
 
 @pytest.fixture
 def run_program(capsys, monkeypatch, tmp_path):
-    """Return a function that runs the program in a folder of examples and returns exit code and output."""
+    """Return a function that runs the program in a folder of example files and returns the exit code and the output."""
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("hi")
     (tmp_path / "outer").mkdir()
@@ -62,7 +62,7 @@ train rl2 --layout demo_wide --size tiny | --size: cannot be used with rl2, whic
 train rl2 --layout all --next-obs --context 5 | --context, --next-obs: cannot be used with rl2, which learns by playing
 train ad --layout demo_wide --epochs 2 | --epochs: cannot be used with ad, only with rl2, which learns by playing
 research reference --name rl2-reference --no-evaluate --bundle-as rl2-x | because the card states its results
-research reference --name rl2-reference --track preference | rl2-reference have no model for it; leave out --track
+research reference --name rl2-reference --track preference | no model of this track exists for rl2-reference; leave out --track
 research reference --name rl2-reference --bundle-as Bad-Name | name = 'Bad-Name': expected lowercase words
 results | Missing option '--out'
 submit empty --out r.json --about a | Missing option '--data'
@@ -97,7 +97,7 @@ evaluate --agent stay --out e --layout cramped_up | no task on cramped_up in
 
 
 def parse_cases(text: str, code: int) -> Iterator[tuple[str, str, int]]:
-    """Yield arguments, expected message and `code` for each line of the form "arguments | message"."""
+    """Yield the arguments, the expected message and `code` for each line, which has the form "arguments | message"."""
     for line in text.strip().splitlines():
         arguments, _, message = line.partition(" | ")
         yield arguments.replace("{MINI}", str(MINI)), message, code

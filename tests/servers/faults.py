@@ -1,4 +1,4 @@
-"""Faults that a test server injects into its answers, and rules that choose the requests."""
+"""Faults that a test server injects into its answers, and rules that choose which requests get a fault."""
 
 from __future__ import annotations
 

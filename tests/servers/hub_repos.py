@@ -135,7 +135,7 @@ class HubState:
     """Repositories and file contents of a test Hub, and the addresses of its two servers.
 
     Args:
-        root: empty folder to store contents of files in.
+        root: empty folder for the contents of files.
         token: access token that allows writing, and reading private repositories.
     """
 

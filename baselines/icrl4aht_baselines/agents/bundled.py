@@ -1,7 +1,8 @@
-"""Models that are part of this package: `models/NAME/TRACK` is the run folder of model NAME for one track, or for all.
+"""Trained models in this package: `models/NAME/TRACK` is the run folder of model NAME for the tasks of TRACK.
 
-A bundled run folder holds the run's settings, its last parameters without the optimizer's state, and its training
-curves. The folder NAME also holds the model's card, and `bundle.json`, which states how the model plays by default.
+TRACK is the name of a track, or "all" for a model that plays all tracks. A bundled run folder holds the run's settings,
+its last parameters without the optimizer's state, and its training curves. The folder NAME also holds the model's
+card, and `bundle.json`, which states how the model plays by default.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from icrl4aht_generation.learners.resume import Checkpoints
 from icrl4aht_baselines.plotting import shrink_picture
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, CONFIG, RUN_CURVES, read_config
-from icrl4aht_data.benchmark.facts import TRACKS, track_of
+from icrl4aht_data.benchmark.facts import TRACKS, layout_track
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.fetch import is_address
 from icrl4aht_data.format.layouts_file import LAYOUTS_NAME
@@ -45,7 +46,8 @@ class BundledModel(NamedTuple):
 
     Attributes:
         name: name of the model, such as "ad-reference".
-        runs: track, or `EVERY_TRACK`, -> run folder of the model for this track.
+        runs: name of a track -> run folder of the model for this track; a model for all tracks has the only key
+            `EVERY_TRACK`.
         sampled: whether the model samples its actions by default, instead of taking the most probable ones.
         role: purpose of the model, such as "best of AD".
         date: day on which the model was bundled, such as "2026-11-24".
@@ -57,9 +59,9 @@ class BundledModel(NamedTuple):
     role: str = ""
     date: str = ""
 
-    def track_on(self, layout: str) -> str:
-        """Return the key of the run in `runs` that plays a layout (short name)."""
-        return EVERY_TRACK if EVERY_TRACK in self.runs else track_of(layout)
+    def run_key(self, layout: str) -> str:
+        """Return the key in `runs` of the run for the layout with this short name."""
+        return EVERY_TRACK if EVERY_TRACK in self.runs else layout_track(layout)
 
 
 def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:

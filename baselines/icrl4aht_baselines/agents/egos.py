@@ -40,7 +40,7 @@ that was used, such as "ad-reference (sampled)"."""
 
 
 class PlayMode(NamedTuple):
-    """Settings of a trained model that acts: how it computes its context and chooses its actions.
+    """Settings with which a trained model acts: how it computes its context and how it chooses its actions.
 
     Attributes:
         acting: how the context is computed, see `ACTING`.
@@ -113,7 +113,7 @@ def agent_names() -> tuple[str, ...]:
 def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool | None = None) -> NamedEgo:
     """Return a reference ego, a bundled model, or the trained model in a run folder of `icrl4aht-data train`.
 
-    A bundled model plays a layout with its parameters for the layout's track, or for all tracks.
+    On each layout, a bundled model uses the parameters for the layout's track, or its parameters for all tracks.
 
     Args:
         name: name of a reference ego or of a bundled model, or path of a run folder.
@@ -149,7 +149,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
     egos = {track: trained_ego(run, mode, str(model.runs[track])) for track, run in runs.items()}
 
     def make_ego(layout: Layout) -> Policy:
-        track = model.track_on(layout.name)
+        track = model.run_key(layout.name)
         if track not in egos:
             raise OptionError(
                 f"{name}: no model for layout {layout.name} of track {track}, only for tracks {' and '.join(egos)}: "
@@ -207,9 +207,10 @@ def trained_policy(method: Method, params: Any, context: int, mode: PlayMode = A
 
 
 def with_channels(policy: Policy, channels: Channels, hide_recipe: bool = False) -> Policy:
-    """Return a policy that receives observations with the given channels.
+    """Return a copy of a policy, to which the environment passes observations with the given channels.
 
-    If policies have equal functions, the converted policies have equal functions too, and share a compiled program.
+    Policies that have the same functions still have the same functions after the conversion, so they can share a
+    compiled program.
 
     Args:
         policy: policy for observations with these channels.

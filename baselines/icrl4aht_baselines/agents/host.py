@@ -45,13 +45,17 @@ class HostAgent(Protocol):
     """Interface of an ego outside JAX, which plays B tasks in parallel and stores its memory itself."""
 
     def reset(self, batch: int) -> None:
-        """Clear the memory, because a new set of `batch` tasks begins."""
+        """Clear the memory and prepare to play `batch` tasks in parallel.
+
+        Called before the first step of the tasks, and before each episode if the evaluation clears the ego's memory.
+        """
         ...
 
     def act(self, ego_input: EgoInput) -> np.ndarray:
-        """Return actions, integers (B,) in 0..5, for an `EgoInput` of arrays (B, ...): obs is uint8 (B, 5, 5, C).
+        """Return the actions in B tasks: integers in 0..5, as an array of shape (B,).
 
-        The arrays are copies, which the agent may keep and change.
+        The arrays of `ego_input` have a leading axis of length B: `obs` is uint8 of shape (B, 5, 5, C). The arrays are
+        copies, which the agent may keep and change.
         """
         ...
 
@@ -59,7 +63,8 @@ class HostAgent(Protocol):
 def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout], HostPolicy]:
     """Return the `make_ego` argument of `icrl4aht_baselines.evaluate.evaluate` for a `HostAgent`.
 
-    For each layout and teammate family, `reset` is called once, then `act` once per step for all tasks.
+    For each layout and teammate family, `reset` is called before the first step, and `act` once per step for all tasks.
+    If the evaluation clears the ego's memory, `reset` is called before each episode.
 
     Args:
         agent: the ego.
@@ -85,7 +90,7 @@ def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout]
             actions = np.asarray(agent.act(EgoInput(*map(np.array, ego_input))))
             if actions.shape != (batch,) or not np.issubdtype(actions.dtype, np.integer):
                 raise OptionError(
-                    f"the agent's act returned {actions.dtype} of shape {actions.shape}, "
+                    f"the agent's method act returned {actions.dtype} of shape {actions.shape}, "
                     f"expected integers of shape ({batch},)"
                 )
             return actions.astype(np.int32)

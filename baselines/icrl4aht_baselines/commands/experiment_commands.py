@@ -25,7 +25,7 @@ from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.proof import PROOF_FILE, proof_table
 
-_STEPS = 8_000_000  # environment steps to train an informed or episodic ego
+_STEPS = 8_000_000  # default environment steps to train each ego of `adaptation-headroom`
 
 _Queued = tuple[Sequence[Any], Callable[[Path], Path], Callable[[Path], str]]
 """Result of a command that `_queue_command` decorates."""
@@ -34,7 +34,7 @@ _Queued = tuple[Sequence[Any], Callable[[Path], Path], Callable[[Path], str]]
 def _queue_command(out: str, card: str) -> Callable[[Callable[..., _Queued]], Callable[..., None]]:
     """Return a decorator that adds --out, --bundle and the queue's options to a command that trains in a job queue.
 
-    The decorated command returns the jobs and two functions. The first writes the jobs' results into a folder and
+    The function of the command returns the jobs and two functions. The first writes the jobs' results into a folder and
     returns the path of the file. The second returns the results in a folder as a table. Results of finished jobs are
     written and printed even if other jobs failed.
 
@@ -54,7 +54,7 @@ def _queue_command(out: str, card: str) -> Callable[[Callable[..., _Queued]], Ca
             from icrl4aht_generation.learners.resume import limit_xla_threads
             from rich.console import Console
 
-            limit_xla_threads(1)  # equal to the workers' limit, so that workers can resume these jobs
+            limit_xla_threads(1)  # as many threads as in workers: jobs resume only with an equal number
             jobs, write, table = command(out=out, **choice)
             console = Console(soft_wrap=True)
             try:
@@ -70,7 +70,7 @@ def _queue_command(out: str, card: str) -> Callable[[Callable[..., _Queued]], Ca
 
 
 def _ego_options(*own: Callable[[Any], Any], **default_text: str) -> Callable[[Any], Any]:
-    """Return a decorator that adds the options of a command that trains egos, including its `own` training options."""
+    """Return a decorator that adds the options of a command that trains egos; `own` are further options."""
     training = dataclass_options(ResponseOptions, "training", exclude=("learning_rate",), default_text=default_text)
     seeds = click.option("--seeds", type=COUNT, default=3, help="Training runs of each ego, with different seeds.")
     tasks, train = topic("Tasks", *shared.tasks_options), topic("Training", *own, seeds, training)
@@ -83,7 +83,7 @@ def control_command(out: Path) -> None:
     """Check that AD and DPT adapt in context.
 
     Trains AD and DPT on bandits, and AD in Dark Room (about 10 minutes). Checks that the models adapt, and that they
-    do not adapt with their context cut off. Exits with 1 if a check fails.
+    do not adapt when their context is cut off. Exits with 1 if a check fails.
     """
     from icrl4aht_baselines.control.control import format_checks, run_control
 
@@ -128,9 +128,9 @@ def _model_returns() -> dict[str, dict[str, float]]:
     Results of controls, in which an ego's memory is cleared or another teammate plays, are left out.
     """
     from icrl4aht_baselines.report.comparison import read_stored, results_file
-    from icrl4aht_baselines.report.results import bundled_by_id, task_label
+    from icrl4aht_baselines.report.results import bundled_tasks_by_id, task_label
 
-    ids, stored = {task_label(task): task for task in bundled_by_id("test")}, read_stored(results_file())
+    ids, stored = {task_label(task): task for task in bundled_tasks_by_id("test")}, read_stored(results_file())
     return {
         agent: {
             ids[task]: float(values.mean())
@@ -166,11 +166,11 @@ def best_response_command(
 ) -> _Queued:
     """Train a best response to each teammate.
 
-    An ego with the benchmark's observations is trained with one teammate, by PPO that imitates the oracle in the first
-    half of the steps. Teammates that behave the same share one best response. Tasks in which the oracle earns no more
-    than `stay` are left out. The best training run is chosen on other episodes than the reported ones. A stored model
-    that earns more replaces the trained best response. Writes OUT/best_responses.json and prints a table. Finished
-    runs are reused, and stopped runs resume. Give more --steps if the return still rises in the last quarter.
+    Trains an ego with the benchmark's observations by PPO, with one teammate. In the first half of the steps, the ego
+    also imitates the oracle. Teammates that behave the same share one best response. Tasks in which the oracle earns no
+    more than `stay` are left out. The best training run is chosen on other episodes than the reported ones. A stored
+    model that earns more replaces the trained best response. Writes OUT/best_responses.json and prints a table.
+    Finished runs are reused, and stopped runs resume. Give more --steps if the return still rises in the last quarter.
     """
     from icrl4aht_baselines.online.responses import (
         ResponseJob,
@@ -206,20 +206,20 @@ def best_response_command(
 def adaptation_headroom_command(
     together: bool, seeds: int, training: dict[str, Any], out: Path, **choice: Any
 ) -> _Queued:
-    """Estimate what memory across episodes can earn.
+    """Estimate how much memory across episodes can raise returns.
 
     Trains two egos on the tasks of each layout. An informed ego observes the task's number in every step; an episodic
     ego has to identify the teammate in each episode. Prints the difference of their returns, with an interval over the
     seeds. The difference is an estimate, because both egos are trained for --steps only. Writes OUT/adaptation.json.
     Finished training runs are reused, and stopped runs resume.
     """
-    from icrl4aht_baselines.online.adaptation import adaptation_table, headroom_jobs, write_adaptation
+    from icrl4aht_baselines.online.adaptation import adaptation_jobs, adaptation_table, write_adaptation
 
     sets: dict[str, list[Task]] = defaultdict(list)
     for task in shared.chosen_tasks(**choice):
         where = "all" if together else task.layout.name
         sets["-".join((task.track, task.split, where, *choice["families"]))].append(task)
-    jobs = headroom_jobs(sets, seeds, replace_options(ResponseOptions(_STEPS), training), out)
+    jobs = adaptation_jobs(sets, seeds, replace_options(ResponseOptions(_STEPS), training), out)
     return jobs, partial(write_adaptation, jobs), adaptation_table
 
 

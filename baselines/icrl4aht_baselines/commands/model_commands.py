@@ -83,9 +83,10 @@ def collect_command(
 ) -> None:
     """Record histories of an agent with a release's teammates.
 
-    Writes a release of source agent: the agent's actions, its choices before noise as expert actions, and the scripted
-    oracle's choices as oracle actions. Oracle actions are left out where the release states that the oracle's return
-    is lower than the return at the end of the histories. Histories with validation teammates are recorded as well.
+    Writes a release of source agent. Its expert actions are the choices of the agent before noise is added, or those of
+    --labeller. Its oracle actions are the scripted oracle's choices; they are left out where the release states that
+    the oracle's return is lower than the return at the end of the histories. Histories with validation teammates are
+    recorded as well.
     """
     from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
@@ -197,10 +198,12 @@ def reference_command(
         if of_track in (*track, EVERY_TRACK)
     ]
     if not jobs:
-        raise click.UsageError(f"--track {track[0]}: {' and '.join(names)} have no model for it; leave out --track")
+        raise click.UsageError(
+            f"--track {track[0]}: no model of this track exists for {' and '.join(names)}; leave out --track"
+        )
     taught = {job.track: None for job in jobs if not (job.recipe.plays or teacher)}
     teachers = [ReferenceJob("rl2-reference", of_track, 0, out, xla_threads=threads) for of_track in taught]
-    if threads:  # equal to the workers' limit, so that workers can resume these jobs
+    if threads:  # as many threads as in workers: jobs resume only with an equal number
         limit_xla_threads(threads)
     run_jobs([*dict.fromkeys([*teachers, *jobs])], out, Console(soft_wrap=True), options)
     if evaluates:
@@ -283,9 +286,9 @@ def submit_command(
 def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: bool) -> None:
     """Compare models on the benchmark's tasks.
 
-    Compares the package's stored results with those of FILEs that `submit` made. Writes a page with tables and a
-    figure (results.md and results.png), and all numbers (results.csv and results.parquet). No two agents may have the
-    same name.
+    Compares the package's stored results with the results in each FILE that `submit` made. Writes a page with tables
+    and a figure (results.md and results.png), and all numbers (results.csv and results.parquet). No two agents may have
+    the same name.
     """
     from icrl4aht_baselines.report import comparison
     from icrl4aht_baselines.report.submission import read_submission
@@ -306,9 +309,9 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
 def models_command() -> None:
     """List the bundled models.
 
-    `evaluate`, `watch` and `collect` accept these names as agents. The first line of a model states its purpose, its
-    score N on each track, its memory control M and its date. A line for each track states method, parameters, context,
-    training layouts and sources, and whether actions are sampled by default.
+    `evaluate`, `watch` and `collect` accept these names as agents. The first line of each model states its purpose, its
+    score N on each track, the benefit M of its memory, and its date. A line for each track states method, parameters,
+    context, training layouts and sources, and whether actions are sampled by default.
     """
     from icrl4aht_baselines.agents.bundled import bundled_models, describe_model
     from icrl4aht_baselines.report.comparison import describe_scores, read_stored, results_file

@@ -25,8 +25,8 @@ from icrl4aht_data.commands.options import (
     TRACK,
     Folder,
     Names,
-    Root,
-    checked_later,
+    ReleaseArgument,
+    accept_any_name,
 )
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
@@ -39,9 +39,9 @@ def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
     return lambda: getattr(import_module(module), name)
 
 
-EGO_NAME = Names("agent", lambda: import_module("icrl4aht_baselines.agents.egos").agent_names(), checked_later)
+EGO_NAME = Names("agent", lambda: import_module("icrl4aht_baselines.agents.egos").agent_names(), accept_any_name)
 """Name of a reference ego, or folder of a run; checked by `icrl4aht_baselines.agents.egos.find_agent`."""
-TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], checked_later)
+TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], accept_any_name)
 METHOD_NAME = Names("method", lambda: import_module("icrl4aht_baselines.methods.registry").all_methods())
 PROTOCOL_NAME = Names("protocol", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "PROTOCOLS"))
 
@@ -89,7 +89,11 @@ suite_option = click.option(
     "--suite", type=Folder("`icrl4aht-data teammates`"), metavar="FOLDER", help="Folder of learned teammates."
 )
 root_option = click.option(
-    "--root", type=Root(), metavar="ROOT", help="A release: folder or address.", show_default="the bundled mini release"
+    "--root",
+    type=ReleaseArgument(),
+    metavar="ROOT",
+    help="A release: folder or address.",
+    show_default="the bundled mini release",
 )
 
 

@@ -8,7 +8,7 @@ import click
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.commands.options import COUNT, LAYOUT, Folder, Names, checked_later, examples
+from icrl4aht_data.commands.options import COUNT, LAYOUT, Folder, Names, accept_any_name, examples
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -16,7 +16,7 @@ from icrl4aht_data.utils.install_hints import import_optional
 from icrl4aht_data.utils.text import counted_noun
 
 _SLOTS = {"ego": EGO, "teammate": TEAMMATE}
-_PARTNER = Names("partner", lambda: ["human", *shared.EGO_NAME.valid(), "H1/t0"], checked_later)
+_PARTNER = Names("partner", lambda: ["human", *shared.EGO_NAME.valid(), "H1/t0"], accept_any_name)
 
 
 @click.command(
@@ -71,9 +71,9 @@ def play_command(
 ) -> None:
     """Play on a web page with a policy or a person.
 
-    Serves the page on this computer only. The game ends with the returns of the person, and of stay, rl2-reference and
-    oracle in the same episodes with the same partner. With --record the episodes are stored as a history of the person,
-    who has to agree to the recording and chooses a pseudonym.
+    Serves the page on this computer only. At the end, the page compares the person's returns with those of the egos
+    stay, rl2-reference and oracle in the same episodes, unless the partner is a person. With --record the episodes are
+    stored as a history of the person, who has to agree to the recording and chooses a pseudonym.
     """
     for module in ("starlette", "uvicorn", "websockets"):
         import_optional(module, "play")

@@ -136,9 +136,9 @@ def report_command(
     """Compare results with the paper's.
 
     RESULTS are folders that `evaluate` made. Prints a summary of each agent, and tables of returns. Results under the
-    protocol `published` are shown next to the paper's numbers. Scores with teammates or on layouts that were in
-    training are marked. Writes the tables as report.md, and all numbers as report.csv. Results of one agent on
-    different layouts are merged.
+    protocol `published` are shown next to the paper's numbers. Scores are marked if the teammates or
+    layouts were used in training. Writes the tables as report.md, and all numbers as report.csv. Results of one agent
+    on different layouts are merged.
     """
     from icrl4aht_baselines.report import page
     from icrl4aht_baselines.report.results import merge, read_run
@@ -264,7 +264,7 @@ def train_command(
     """
     shared.join_processes(**machines)
     from icrl4aht_baselines.methods.registry import PLAYING
-    from icrl4aht_baselines.training.histories import start_from
+    from icrl4aht_baselines.training.histories import load_initial_params
     from icrl4aht_baselines.training.run_folder import RUN_CURVES
     from icrl4aht_baselines.training.trainer import show_steps
 
@@ -274,7 +274,7 @@ def train_command(
         raise click.UsageError(f"--processes: {method} is trained by one process on one device; leave out --processes")
     job, description = shared.prepare_training(method, size, model, train, play, choice, manifests)
     click.echo(description)
-    params, steps = None if init is None else start_from(init, job.method, job.about), job.options.steps
+    params, steps = None if init is None else load_initial_params(init, job.method, job.about), job.options.steps
     with progress_bars(unit="steps") as show:
         job.train(folder, params=params, log_to=log_to, done=show_steps(show, method, steps))
     trained = counted_noun(steps, "step")
@@ -286,7 +286,7 @@ def train_command(
 @click.command("demo")
 @click.option("--out", type=Folder(), metavar="FOLDER", default="build/demo", help="Write everything here.")
 def demo_command(out: Path) -> None:
-    """Demonstrate every step on the bundled release.
+    """Load data, train, evaluate and report on the bundled release.
 
     Loads, samples and verifies the release. Trains Hybrid-AD on histories of a script that finds out which dish its
     teammate wants. Evaluates the model on validation tasks, also with its memory cleared before each episode. Draws the

@@ -12,7 +12,7 @@ def _verb(module: str, name: str, section: str, help: str) -> Verb:
 
 
 VERBS = (
-    _verb("train", "demo", _TRAIN, "Demonstrate every step on the bundled release."),
+    _verb("train", "demo", _TRAIN, "Load data, train, evaluate and report on the bundled release."),
     _verb("train", "train", _TRAIN, "Train a model on learning histories."),
     _verb("train", "evaluate", _TRAIN, "Evaluate an agent on test tasks, or on validation tasks."),
     _verb("train", "report", _TRAIN, "Compare results with the paper's."),
@@ -23,7 +23,7 @@ VERBS = (
     _verb("play", "play", _TRAIN, "Play on a web page with a policy or a person."),
     _verb("model", "collect", _TRAIN, "Record histories of an agent with a release's teammates."),
     _verb("experiment", "best-response", _TRAIN, "Train a best response to each teammate."),
-    _verb("experiment", "adaptation-headroom", _TRAIN, "Estimate what memory across episodes can earn."),
+    _verb("experiment", "adaptation-headroom", _TRAIN, "Estimate how much memory across episodes can raise returns."),
     _verb("experiment", "control", _TRAIN, "Check that AD and DPT adapt in context."),
     _verb("model", "research reference", _CHECKS, "Make reference models, and the data that they are trained on."),
     _verb("experiment", "research proof", _CHECKS, "Show what models learn from a release."),

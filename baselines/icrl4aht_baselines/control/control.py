@@ -2,7 +2,7 @@
 
 The methods, tokenizers and trainer of the benchmark are used. On Bernoulli bandits, DPT is compared with Thompson
 sampling, and AD with the algorithm that it distils. AD also plays Dark Room with goals that are not in its training
-data. Each model must fail with its context cut off, which shows that the environment requires adaptation.
+data. Each model must fail when its context is cut off, which shows that the environment requires adaptation.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def _bandit_checks(
 
     def model_regret(context: int) -> float:
         policy = trained_policy(method, state.params, context, PlayMode(greedy=False))
-        return regret(worlds.play_world(worlds.bandit(), policy, jnp.asarray(means), 0, size.bandit_steps)[0])
+        return regret(worlds.play_small_tasks(worlds.bandit(), policy, jnp.asarray(means), 0, size.bandit_steps)[0])
 
     rival_regret = regret(worlds.play_bandits(rival[1], means, size.bandit_steps, rng)[0])
     uniform = float((means.max(axis=1) - means.mean(axis=1)).mean()) * size.bandit_steps
@@ -159,7 +159,7 @@ def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list
     method = ad(DARK_ROOM_MODEL, small.world)
 
     def make_histories(count: int, some: np.ndarray) -> Any:
-        cells, actions, rewards = worlds.search_histories(rng.choice(some, count), size.room_episodes, rng)
+        cells, actions, rewards = worlds.dark_room_histories(rng.choice(some, count), size.room_episodes, rng)
         return worlds.ad_rows(worlds.CELL_OBS[cells], actions, rewards, small.episode)
 
     rows = [make_histories(size.rows, known), make_histories(512, held_out)]
@@ -169,9 +169,9 @@ def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list
     steps = size.room_episodes * small.episode
 
     def share_of_best(context: int) -> np.ndarray:
-        """Return the mean ratio of the return to the best possible return in each episode, float (episodes,)."""
+        """Return, for each episode, the return divided by the best possible return, as a mean over the tasks."""
         policy = trained_policy(method, state.params, context, PlayMode(greedy=False))
-        _, rewards = worlds.play_world(small, policy, jnp.asarray(tasks, jnp.int32), 0, steps)
+        _, rewards = worlds.play_small_tasks(small, policy, jnp.asarray(tasks, jnp.int32), 0, steps)
         returns = np.asarray(rewards).reshape(len(tasks), -1, small.episode).sum(axis=-1)
         return (returns / best[:, None]).mean(axis=0)
 
@@ -190,7 +190,7 @@ def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list
 def _train(
     method: Method, rows: list[Any], size: ControlSize, number: int, folder: Path, done: StepProgress
 ) -> TrainState:
-    """Train on the first set of rows and validate on the second; `number` is the index into `ControlSize.updates`."""
+    """Train on the first data set in `rows`, validate on the second; `number` is an index of `ControlSize.updates`."""
     updates = size.updates[number]
     options = TrainOptions(
         steps=updates,

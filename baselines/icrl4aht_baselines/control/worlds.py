@@ -62,7 +62,7 @@ ARMS = 5
 
 
 def bandit() -> SmallWorld:
-    """Return the environment of Bernoulli bandits: a task is the arms' means, float32 (5,); a reward is 1 or 0."""
+    """Return the environment of Bernoulli bandits. A task is the means of the 5 arms; a reward is 1 or 0."""
 
     def step(means: Array, state: Array, action: Array, key: Array) -> tuple[Array, Array]:
         return state, 1.0 * (jax.random.uniform(key) < means[action])
@@ -90,7 +90,7 @@ NEXT_CELLS = (_TO[..., 0] * SIDE + _TO[..., 1]).astype(np.int32)
 
 
 def dark_room() -> SmallWorld:
-    """Return the environment Dark Room: a task is the goal's grid cell, int32 (); a step that ends there earns 1."""
+    """Return the environment Dark Room. A task is the number of the goal's cell; a step that ends on it earns 1."""
     next_cells = jnp.asarray(NEXT_CELLS)
 
     def step(goal: Array, cell: Array, action: Array, key: Array) -> tuple[Array, Array]:
@@ -102,14 +102,14 @@ def dark_room() -> SmallWorld:
 
 
 def best_return(goal: np.ndarray) -> np.ndarray:
-    """Return the highest possible returns in Dark Room, float (N,): those of a straight walk to the goal."""
+    """Return the highest possible return in Dark Room for each goal: the return of a straight walk to the goal."""
     return ROOM_STEPS + 1.0 - np.maximum(_distance(goal, np.asarray(MIDDLE)), 1)
 
 
-def play_world(
+def play_small_tasks(
     small: SmallWorld, policy: Policy, tasks: Array, seed: int, steps: int
 ) -> tuple[Int[Array, "N T"], Float[Array, "N T"]]:
-    """Play tasks with an ego that keeps its memory for a complete task. Return its actions and rewards."""
+    """Play tasks of a small environment. The ego keeps its memory for a complete task. Return actions and rewards."""
 
     def play_task(task: Array, key: Array) -> tuple[Array, Array]:
         def step(carry: Any, t: Array) -> tuple[Any, Any]:
@@ -164,7 +164,7 @@ def ucb(wins: np.ndarray, losses: np.ndarray, t: int, rng: np.random.Generator) 
 def play_bandits(
     choose: BanditAlgorithm, means: np.ndarray, steps: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Play bandits with means (N, arms). Return actions, int32 (N, T), and rewards, float32 (N, T)."""
+    """Play N bandits, with means of shape (N, arms). Return int32 actions and float32 rewards, both of shape (N, T)."""
     wins, losses = np.zeros_like(means), np.zeros_like(means)
     row, actions, rewards = np.arange(len(means)), [], []
     for t in range(steps):
@@ -177,10 +177,10 @@ def play_bandits(
     return np.stack(actions, axis=1).astype(np.int32), np.stack(rewards, axis=1).astype(np.float32)
 
 
-def search_histories(
+def dark_room_histories(
     goals: np.ndarray, episodes: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Dark Room histories of a learner that finds the goal: positions, actions (int32), rewards (float32).
+    """Return Dark Room histories of a learner that finds the goal: positions and actions (int32), rewards (float32).
 
     The arrays have shape (N, T). The learner walks between random grid cells until it is rewarded, and from then on
     straight to the cell of that reward. Half of its moves are random at first. The share of random moves falls linearly
@@ -212,7 +212,7 @@ def _distance(one: np.ndarray, two: np.ndarray) -> np.ndarray:
 
 
 def ad_rows(obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, episode: int) -> ADBatch:
-    """Return complete histories (N, T, ..) as the windows of an AD batch."""
+    """Return an AD batch in which each window is a complete history. The arguments are arrays of shape (N, T, ..)."""
     t = np.arange(actions.shape[1])
     dones = np.broadcast_to((t + 1) % episode == 0 if episode else t < 0, actions.shape)
     before = [np.pad(array[:, :-1], ((0, 0), (1, 0))) for array in (actions, rewards)]

@@ -1,6 +1,6 @@
 """Evaluation of an ego on tasks under a named protocol (paper, Sec. 4.3).
 
-A task is a sequence of 100 episodes of 100 steps. The ego's memory lasts for the task, the teammate's for an episode.
+A task is a sequence of 100 episodes of 100 steps. An ego keeps its memory for a task, a teammate for an episode.
 The random key of an episode is a function of (seed, task_id, episode), so a task's result does not depend on the other
 tasks of the same batch or process. Two controls, of memory and of partner, show how much an ego earns by remembering
 earlier episodes with the same teammate.
@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from icrl4aht_generation.policy import Policy
-from icrl4aht_generation.teammates.registry import build_teammate, check_theta, with_equal_parameters
+from icrl4aht_generation.teammates.registry import build_teammate, check_theta, with_equal_parameter_names
 from jaxtyping import Float
 
 from icrl4aht_baselines.agents.egos import SCRIPTED
@@ -75,7 +75,7 @@ def evaluate(
 ) -> list[Result]:
     """Evaluate an ego and return one result per task, in the order of `tasks`.
 
-    Progress is shown unless `played` is given: as a bar, or as one line per minute if stderr is not a terminal.
+    Unless `played` is given, progress is shown as a bar, or as one line per minute if stderr is not a terminal.
 
     Args:
         agent: name of the ego in results and reports.
@@ -271,7 +271,7 @@ def prepare_rollout(
     several = len(layouts) > 1
     mates = [
         build_teammate(None if several else task.layout, entry, TEAMMATE, protocol.noise, suite)
-        for task, entry in zip(tasks, with_equal_parameters([task.teammate for task in tasks]), strict=True)
+        for task, entry in zip(tasks, with_equal_parameter_names([task.teammate for task in tasks]), strict=True)
         for _ in seeds
     ]
     numbers = np.array([layouts.index(task.layout) for task in tasks for _ in seeds]) if several else None
@@ -304,7 +304,7 @@ def play_tasks(
         forget: whether the egos' memory is cleared before each episode.
 
     Yields:
-        One `EpisodeBatch` after another with B = tasks x seeds; seeds vary fastest.
+        An `EpisodeBatch` for each episode, with B = tasks x seeds rows; seeds vary fastest.
 
     Raises:
         OptionError: if the protocol changes teammates within these episodes, which only `evaluate` supports.
@@ -328,7 +328,7 @@ def play_episodes(
         forget: whether the egos' memory is cleared before each episode.
 
     Yields:
-        One `EpisodeBatch` after another.
+        An `EpisodeBatch` for each episode.
 
     Returns:
         The state after the last episode.
@@ -371,7 +371,7 @@ class ControlledResults(NamedTuple):
 
     @property
     def partner(self) -> Float[np.ndarray, "U S"]:
-        """Benefit P of the right context: last episodes' return minus that return after another teammate's episodes."""
+        """Benefit P of the right context: mean return of the last episodes, minus their return in `swapped`."""
         return (_stacked_returns(self.plain) - _stacked_returns(self.swapped))[..., -self.last :].mean(axis=-1)
 
 

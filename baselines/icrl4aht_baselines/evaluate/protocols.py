@@ -49,7 +49,7 @@ class Protocol:
 
     @property
     def last_episodes(self) -> int:
-        """Number of a task's last episodes, which show the ego's adaptation: 20, or half of all if that is less."""
+        """Number of episodes at the end of a task that measure adaptation: 20, or half of all if that is less."""
         return max(1, min(LAST_EPISODES, self.episodes // 2))
 
 
@@ -171,7 +171,7 @@ class PlannedTask(NamedTuple):
 
     Attributes:
         task: the evaluated task.
-        played: for each segment, `task` with the teammate and the recipes of its partner task.
+        played: for each segment, `task` with the teammate and the recipes of the segment's partner task.
         partners: ids of the partner tasks, one per segment; empty if there is only one segment.
     """
 
@@ -201,9 +201,10 @@ def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | Non
     """Return each task with the teammates of its segments, which come from the task itself or from partner tasks.
 
     A partner task is on the same layout and of the next teammate family, in the order of `tasks`: the first task of a
-    family gets the first task of the next family, and so on. If all tasks are of one family, the partner is the next
-    task with another teammate. Under the control `swapped`, the partner's teammate plays first. Under a protocol that
-    swaps teammates, the task's teammate plays first, then that of its partner, then that of the partner's partner.
+    family gets the first task of the next family, and so on. For a task with a fixed dish, only tasks with another dish
+    count. If no other family is left, the partner is the next task with another teammate or another dish. Under the
+    control `swapped`, the partner's teammate plays first. Under a protocol that swaps teammates, the task's teammate
+    plays first, then the partner's teammate, then the teammate of the partner's partner.
 
     Raises:
         OptionError: if a task has no partner (the message names the task), or see `segment_lengths`.
@@ -227,7 +228,7 @@ def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | Non
 
 def _find_partner_task(task: Task, on_layout: Sequence[Task]) -> Task:
     def has_other_dish(other: Task) -> bool:
-        # The ego does not see a dish that the task fixes, so the partner task must fix another dish as well.
+        # If the task fixes a dish, the ego has to find out the dish, so a partner task needs another dish.
         return task.recipes is None or other.recipes != task.recipes
 
     ids = [other.task_id for other in on_layout]

@@ -35,7 +35,7 @@ class RolloutState(NamedTuple):
     Attributes:
         env: states of the B environments.
         ego: memories of the egos, a pytree of arrays (B, ...).
-        before: outcome of the previous step, arrays (B,); the field `obs` is not used.
+        before: outcome of the previous step, arrays of shape (B,); the field `obs` is not used.
     """
 
     env: EnvState
@@ -93,17 +93,17 @@ class EvaluationRollout:
         return stacked(mate.params for mate in self.teammates)
 
     def start(self, keys: jax.Array) -> RolloutState:
-        """Return the state before the first episode, from the random keys of the tasks (B,)."""
+        """Return the state before the first episode; `keys` are the random keys of the B tasks."""
         return RolloutState(
             self.env.init(keys, self._layout_numbers()), self._initial_memories(keys), no_outcome(keys.shape[0])
         )
 
     def clear_memory(self, state: RolloutState) -> RolloutState:
-        """Return a state between two episodes in which the egos' memories are reset to those of a new task."""
+        """Return a copy of a state between two episodes, with the egos' memories reset as for a new task."""
         return state._replace(ego=self._initial_memories(state.env.key), before=no_outcome(state.env.key.shape[0]))
 
     def move_to_layouts(self, state: RolloutState) -> RolloutState:
-        """Return the state of another rollout of the same tasks, so that the next episode is on this rollout's layouts.
+        """Convert the state of another rollout of the same tasks: its next episode is played on this rollout's layouts.
 
         Args:
             state: state of the other rollout, between two episodes. Its random keys, episode number and the egos'
@@ -218,7 +218,8 @@ class ProgramCache:
         policies = [(policy.init, policy.act, policy.sees) for policy in (rollout.ego, rollout.teammates[0])]
         layouts = rollout.layout if isinstance(rollout.layout, Layout) else tuple(rollout.layout)
         shapes = tuple((np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves)
-        rules = rollout.protocol.steps, rollout.protocol.four_recipes  # other rules only change states and policies
+        # The protocol's other fields change states and policies, but not the program.
+        rules = rollout.protocol.steps, rollout.protocol.four_recipes
         key = layouts, rules, *policies, structure, shapes
         with self._lock:
             lock = self._locks.setdefault(key, Lock())

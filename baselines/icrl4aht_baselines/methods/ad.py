@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
-from icrl4aht_generation.learners.encoder import encoding_log
+from icrl4aht_generation.learners.encoder import encoding_metrics
 from jaxtyping import Array, Bool, Float, Int
 
 from icrl4aht_baselines.methods.method import (
@@ -19,14 +19,14 @@ from icrl4aht_baselines.methods.method import (
     change_if,
     cross_entropy,
     make_next_obs_head,
-    make_tokens,
+    make_tokenizer,
     make_transformer,
     mean_of_rows,
     run_model,
     squared_error,
 )
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.methods.tokens import StepInput, StepTokens, batch_steps
+from icrl4aht_baselines.methods.tokens import StepInput, StepTokenizer, batch_steps
 from icrl4aht_data.sampling.ad import ADBatch
 
 
@@ -64,7 +64,7 @@ class StepModel(nn.Module):
     sequences, so padding needs no mask except in the loss.
     """
 
-    tokens: StepTokens
+    tokens: StepTokenizer
     trunk: Any
     head: nn.Module
     next_obs: nn.Module | None = None
@@ -114,7 +114,7 @@ class StepModel(nn.Module):
 
 
 def dropped_steps(context: int) -> int:
-    """Return how many steps cached acting drops at once from a full window of `context` steps: a fifth.
+    """Return how many steps an ego with a cached memory drops if its window of `context` steps is full: a fifth.
 
     A full window then has at least 4/5 of the context, and on average 4 tokens are computed again for each step.
     """
@@ -123,7 +123,7 @@ def dropped_steps(context: int) -> int:
 
 def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module) -> StepModel:
     """Return a `StepModel` with the given trunk and head."""
-    return StepModel(make_tokens(StepTokens, options, world), trunk, head, make_next_obs_head(options, world))
+    return StepModel(make_tokenizer(StepTokenizer, options, world), trunk, head, make_next_obs_head(options, world))
 
 
 def step_method(name: str, label: str, model: StepModel, loss: Loss, world: World, **settings: Any) -> Method:
@@ -171,7 +171,7 @@ def action_method(name: str, label: str, options: ModelOptions, world: World, tr
             **(auxiliary := auxiliary_losses(output, steps, batch, world)),
         }
         total = sum(auxiliary.values(), start=log["action_loss"])
-        return total, {"loss": total, **log, **encoding_log(steps.obs)}
+        return total, {"loss": total, **log, **encoding_metrics(steps.obs)}
 
     return step_method(name, label, model, loss, world, logits=lambda head: head)
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from icrl4aht_generation.learners.encoder import encoding_log
+from icrl4aht_generation.learners.encoder import encoding_metrics
 from jaxtyping import Array, Float
 
 from icrl4aht_baselines.methods.ad import StepOutput, auxiliary_losses, make_step_model, step_method
@@ -39,8 +39,8 @@ class ActorCriticOutput(NamedTuple):
     """Policy logits and action values for each of G discount factors.
 
     Attributes:
-        logits: float32 (*B, G, A).
-        values: float32 (CRITICS, *B, G, A).
+        logits: float32, of shape (*B, G, A).
+        values: float32, of shape (CRITICS, *B, G, A).
     """
 
     logits: Float[Array, "*B G A"]
@@ -102,7 +102,7 @@ def amago_offline(options: ModelOptions, world: World) -> Method:
             **(auxiliary := auxiliary_losses(output, steps, batch, world)),
         }
         total = sum(auxiliary.values(), start=actor + CRITIC_WEIGHT * critic)
-        return total, {"loss": total, **log, **encoding_log(steps.obs)}
+        return total, {"loss": total, **log, **encoding_metrics(steps.obs)}
 
     settings: Any = {"logits": lambda output: output.logits[..., -1, :], "slow": SLOW, "takes_labels": False}
     return step_method("amago_offline", "AMAGO-Offline", model, loss, world, **settings)

@@ -23,10 +23,11 @@ def causal_attention(q: Array, k: Array, v: Array, *own: Array) -> Float[Array, 
     """Return causal attention: each token attends to itself and the tokens before it.
 
     Args:
-        q: queries (B, N, H, Dh).
-        k, v: keys and values of the same tokens (B, N, H, Dh); with `own`, those of a context (B, K, H, Dh).
-        own: if given, key and value of each query (B, N, H, Dh). Query j then attends to the first j tokens of the
-            context and to itself.
+        q: queries, of shape (B, N, H, Dh).
+        k, v: keys and values of the same tokens, of the same shape; with `own`, keys and values of a context, of shape
+            (B, K, H, Dh).
+        own: if given, keys and values of the queries, both of shape (B, N, H, Dh). Query j then attends to the first j
+            tokens of the context and to itself.
     """
     seen_by_first = 0 if own else 1
     q, k, v = (x.swapaxes(1, 2) for x in (q / q.shape[-1] ** 0.5, k, v))
@@ -42,7 +43,7 @@ def causal_attention(q: Array, k: Array, v: Array, *own: Array) -> Float[Array, 
 
 
 def _map_long_blocks(seen_by_first: int, k: Array, v: Array, *rows: Array) -> Array:
-    """Return causal attention of arrays (B, H, N, Dh), computed in blocks of `LONG_ROWS` rows."""
+    """Return causal attention of arrays of shape (B, H, N, Dh), computed in blocks of `LONG_ROWS` rows."""
     batch, heads, length, width = rows[0].shape
     blocks = -(-length // LONG_ROWS)
     padding = ((0, 0), (0, 0), (0, blocks * LONG_ROWS - length), (0, 0))

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
-from icrl4aht_generation.learners.encoder import encoding_log
+from icrl4aht_generation.learners.encoder import encoding_metrics
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from icrl4aht_baselines.methods.method import (
@@ -24,13 +24,13 @@ from icrl4aht_baselines.methods.method import (
     change_if,
     cross_entropy,
     make_next_obs_head,
-    make_tokens,
+    make_tokenizer,
     make_transformer,
     run_model,
     squared_error,
 )
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.methods.tokens import StepInput, Transition, TransitionTokens, batch_transitions
+from icrl4aht_baselines.methods.tokens import StepInput, Transition, TransitionTokenizer, batch_transitions
 from icrl4aht_baselines.methods.transformer import Transformer, TransformerMemory
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.sampling.dpt import DPTBatch
@@ -77,7 +77,7 @@ class DPT(nn.Module):
     single steps.
     """
 
-    tokens: TransitionTokens
+    tokens: TransitionTokenizer
     trunk: Transformer
     head: nn.Module
     obs_shape: tuple[int, ...]
@@ -85,7 +85,10 @@ class DPT(nn.Module):
     finished_episodes_only: bool = True
 
     def __call__(self, context: Transition, query: Any, deterministic: bool = True) -> DPTOutput:
-        """Return the predictions after every prefix of a context (B, K), for queries (B, ..) or (B, Q, ..)."""
+        """Return the predictions after every prefix of a context of K transitions.
+
+        Queries have the shape (B, ..), or (B, Q, ..) for several queries of each context.
+        """
         tokens_BxKxD, obs_features = self.tokens.context(context, deterministic)
         batch, length, width = tokens_BxKxD.shape
         queries_BxQxD = self.tokens.query(query, deterministic).reshape(batch, -1, width)
@@ -138,13 +141,13 @@ class DPT(nn.Module):
 
 
 def _repeat_in_turn(values: Shaped[Array, "B Q ..."], length: int) -> Shaped[Array, "B K+1 ..."]:
-    """Repeat Q values in turn for the K + 1 prefixes of a context, K = `length`: value j mod Q for prefix j."""
+    """Return one of Q values for each of the K + 1 prefixes of a context, K = `length`: value j mod Q for prefix j."""
     return values[:, jnp.arange(length + 1) % values.shape[1]]
 
 
 def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True) -> Method:
     """Return the method DPT; with default options and C = 40 channels its model has 3,285,022 parameters."""
-    tokens = make_tokens(TransitionTokens, options, world)
+    tokens = make_tokenizer(TransitionTokenizer, options, world)
     head, next_obs = nn.Dense(world.actions), make_next_obs_head(options, world)
     model = DPT(tokens, make_transformer(options), head, world.obs_shape, next_obs, finished_episodes_only)
 
@@ -160,7 +163,7 @@ def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True
             after = world.observations(context.obs)[:, 1:, 1]
             log["next_obs_loss"] = squared_error(output.next_obs, after).mean()
             total += log["next_obs_loss"]
-        return total, {"loss": total, **log, **encoding_log(context.obs)}
+        return total, {"loss": total, **log, **encoding_metrics(context.obs)}
 
     both, none = jnp.zeros((1, 2, 2, *world.obs_shape)), jnp.zeros((1, 2), jnp.int32)
     example = (Transition(both, none, jnp.zeros((1, 2)), none), both[:, 0, 0])

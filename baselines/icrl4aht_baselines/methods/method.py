@@ -19,14 +19,14 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.methods.tokens import BatchView, StepInput, Tokens
+from icrl4aht_baselines.methods.tokens import BatchView, StepInput, Tokenizer
 from icrl4aht_baselines.methods.transformer import Transformer
 from icrl4aht_data.overcooked.actions import ACTIONS
 
 Loss = Callable[[Any, Any, Any, Any], tuple[Array, dict[str, Array]]]
 """Function from (parameters, slow parameters or None, batch, dropout key or None) to the loss and numbers to log."""
 
-TokensType = TypeVar("TokensType", bound=Tokens)
+TokenizerType = TypeVar("TokenizerType", bound=Tokenizer)
 Changed = TypeVar("Changed")
 
 
@@ -34,7 +34,7 @@ class World(NamedTuple):
     """Description of the environment that a model acts in.
 
     Attributes:
-        encoder: function of a dtype that returns a module from the output of `view` (or observations) to features.
+        encoder: function from a dtype to a module, which maps the output of `view` (or observations) to features.
         obs_shape: shape of one observation.
         view: function that returns the encoder's input for a batch.
         actions: number of actions.
@@ -52,7 +52,7 @@ class World(NamedTuple):
 
 @dataclass(frozen=True)
 class Method:
-    """A training method: model, data and loss. A function of (ModelOptions, World) makes each method.
+    """A training method: model, data and loss. Methods are made by functions that take `ModelOptions` and a `World`.
 
     Attributes:
         name: name in `registry.METHODS`.
@@ -91,7 +91,7 @@ class Method:
         return self.model.apply({}, context, cached, method="start")
 
     def act(self, params: Any, step: StepInput, done: Bool[Array, ""], memory: Any) -> tuple[Float[Array, " A"], Any]:
-        """Return policy logits, float32, and the new memory; `done` is whether the previous step ended an episode."""
+        """Return policy logits, float32, and the new memory; `done` is true if the previous step ended an episode."""
         output, memory = self.model.apply({"params": params}, step, done, memory, method="act")  # type: ignore[misc]
         return self.logits(output).astype(jnp.float32), memory
 
@@ -106,8 +106,8 @@ def make_transformer(options: ModelOptions) -> Transformer:
     return Transformer(options.layers, options.width, options.heads, options.dropout, options.positions, options.remat)
 
 
-def make_tokens(kind: type[TokensType], options: ModelOptions, world: World, **own: Any) -> TokensType:
-    """Return a tokenizer of the class `kind`, where `own` holds the arguments that only this class has."""
+def make_tokenizer(kind: type[TokenizerType], options: ModelOptions, world: World, **own: Any) -> TokenizerType:
+    """Return a tokenizer of the class `kind`; `own` are arguments that only this class takes."""
     dtype = compute_dtype(options)
     return kind(
         encoder=world.encoder(dtype),
@@ -177,7 +177,7 @@ def change_if(
     computes the change only if the condition holds for at least one row of the batch.
 
     Args:
-        condition: bool ().
+        condition: a scalar bool.
         change: pure function of its arguments alone; the result has the shapes and dtypes of `memory`.
         params: pytree of arrays.
         memory: pytree of arrays.

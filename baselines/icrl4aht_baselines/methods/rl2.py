@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float
 
 from icrl4aht_baselines.methods.ad import example_step
 from icrl4aht_baselines.methods.hybrid_ad import RecurrentTrunk
-from icrl4aht_baselines.methods.method import Method, World, make_tokens
+from icrl4aht_baselines.methods.method import Method, World, make_tokenizer
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.methods.tokens import StepInput, StepTokens
+from icrl4aht_baselines.methods.tokens import StepInput, StepTokenizer
 
 
 class PolicyValue(NamedTuple):
@@ -50,12 +50,12 @@ class PolicyValueHead(nn.Module):
 class RL2Model(nn.Module):
     """Model of RL^2: tokenizer of steps, GRU layers, and head. The recurrent state has S = layers x D numbers."""
 
-    tokens: StepTokens
+    tokens: StepTokenizer
     trunk: RecurrentTrunk
     head: PolicyValueHead
 
     def __call__(self, steps: StepInput, state: Float[Array, "B S"]) -> tuple[PolicyValue, Float[Array, "B S"]]:
-        """Return the output for T steps of B tasks, inputs with axes (T, B, ..), and the state after the last step."""
+        """Return the output for T steps of B tasks, and the last state. `steps` has the axes (T, B, ..)."""
         features, state = self.trunk.run_sequences(self.tokens(steps), state)
         return self.head(features), state
 
@@ -78,7 +78,7 @@ def _raise_no_batch_loss(params: Any, slow: Any, batch: Any, key: Any) -> tuple[
 def rl2(options: ModelOptions, world: World) -> Method:
     """Return the method RL^2."""
     trunk = RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
-    tokens = make_tokens(StepTokens, options, world, partners=world.partners)
+    tokens = make_tokenizer(StepTokenizer, options, world, partners=world.partners)
     model = RL2Model(tokens, trunk, PolicyValueHead(options.width, world.actions))
     step = example_step(world)
     step = step._replace(partner=step.prev_action if world.partners else None)

@@ -66,7 +66,7 @@ def plain_view(obs: Array, layouts: Array | None) -> Array:
 
 
 def batch_steps(batch: ADBatch, view: BatchView) -> StepInput:
-    """Return an AD batch as a `StepInput` of arrays (B, L, ..)."""
+    """Return an AD batch as a `StepInput`, with arrays of shape (B, L, ..)."""
     obs = group_equal(view(batch.obs, batch.layouts))
     return StepInput(obs, batch.prev_actions, batch.prev_rewards, batch.prev_teammate_actions)  # type: ignore[arg-type]
 
@@ -77,14 +77,14 @@ def input_step(ego_input: Any) -> StepInput:
 
 
 def batch_transitions(batch: DPTBatch, view: BatchView) -> tuple[Transition, Any]:
-    """Return a DPT batch as context transitions (B, K, ..) and query observations, (B, ..) or (B, Q, ..)."""
+    """Return a DPT batch as transitions of shape (B, K, ..) and queries of shape (B, ..) or (B, Q, ..)."""
     both = jnp.stack([jnp.asarray(batch.context_obs), jnp.asarray(batch.context_next_obs)], axis=2)
     obs, query = group_equal(view(both, batch.layouts)), view(batch.query_obs, batch.layouts)
     mate: Any = batch.context_teammate_actions
     return Transition(obs, batch.context_actions, batch.context_rewards, mate), query  # type: ignore[arg-type]
 
 
-class Tokens(nn.Module):
+class Tokenizer(nn.Module):
     """Base class of tokenizers.
 
     Args:
@@ -106,11 +106,11 @@ class Tokens(nn.Module):
     reward_scale: float = 1.0
 
 
-class StepTokens(Tokens):
+class StepTokenizer(Tokenizer):
     """Tokenizer of steps: [Emb(a'); Emb(teammate's a') with +TA; r'; Enc(o)], projected (paper, App. E.2).
 
     Args:
-        partners: number of different values of `StepInput.partner`; 0 if the teammate's number is no input.
+        partners: number of different values of `StepInput.partner`; 0 if the teammate's number is not an input.
     """
 
     partners: int = 0
@@ -128,7 +128,7 @@ class StepTokens(Tokens):
         return nn.Dropout(self.dropout)(token, deterministic=deterministic)
 
 
-class TransitionTokens(Tokens):
+class TransitionTokenizer(Tokenizer):
     """Tokenizer of transitions: [Enc(o); OneHot(a); OneHot(teammate's a) with +TA; Enc(o'); r], projected.
 
     A query observation becomes [Enc(o); zeros] with the same projection (paper, App. E.3).
@@ -138,7 +138,7 @@ class TransitionTokens(Tokens):
         self.project, self.drop = nn.Dense(self.width), nn.Dropout(self.dropout)
 
     def context(self, transition: Transition, deterministic: bool = True) -> tuple[Array, Float[Array, "*B F"]]:
-        """Return one token (*B, D) for each transition, and the encoded observations before the actions."""
+        """Return a token for each transition, of shape (*B, D), and the encoded observations before the actions."""
         seen = self.encoder(transition.obs)
         before, after = seen[..., 0, :], seen[..., 1, :]
         parts = [before, jax.nn.one_hot(transition.action, self.actions)]

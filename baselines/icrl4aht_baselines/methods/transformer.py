@@ -119,7 +119,7 @@ def _rotate(x_BxNxHxDh: Float[Array, "B N H Dh"], positions_N: Int[Array, " N"])
 
 
 class Transformer(nn.Module):
-    """Transformer blocks followed by a layer norm, from tokens to features.
+    """Transformer from tokens to features: blocks, followed by a layer norm.
 
     Args:
         layers: number of blocks.

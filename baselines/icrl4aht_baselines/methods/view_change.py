@@ -81,7 +81,7 @@ def _exchange_directions(obs: Array, one: str, other: str) -> Array:
 
 
 def no_change() -> ViewChange:
-    """Return a `ViewChange` without axes that leaves observations and actions unchanged."""
+    """Return a `ViewChange` of scalars that leaves observations and actions unchanged."""
     no: Any = jnp.bool_(False)
     return ViewChange(no, no, no)
 

@@ -3,7 +3,7 @@
 Two recurrent egos are trained on the same tasks with the same budget, and both have their memory cleared before each
 episode. The *informed* ego observes the task's number in every step; the *episodic* ego has to find out within the
 episode which teammate it plays with. The informed ego's return minus the episodic ego's return estimates how much
-memory across episodes can earn. It is an estimate, because longer training would raise both returns.
+memory across episodes can raise the return. It is an estimate, because longer training would raise both returns.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
-from icrl4aht_generation.teammates.registry import build_teammate, with_equal_parameters
+from icrl4aht_generation.teammates.registry import build_teammate, with_equal_parameter_names
 from scipy import stats
 
 from icrl4aht_baselines.online.responses import EgoJob
@@ -36,7 +36,7 @@ _MEASURE_SEED = 1_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeadroomJob(EgoJob):
+class AdaptationJob(EgoJob):
     """Job that trains an informed or episodic ego on a set of tasks, and measures its returns.
 
     Attributes:
@@ -84,28 +84,28 @@ class HeadroomJob(EgoJob):
         """Return the tasks that are played in parallel, in which each of `tasks` appears about equally often."""
         of_kind = grouped(self.tasks, lambda task: task.teammate_kind)
         several = {kind for kind, own in of_kind.items() if len({task.layout for task in own}) > 1}
-        different, entries = [], with_equal_parameters([task.teammate for task in self.tasks])
+        different, entries = [], with_equal_parameter_names([task.teammate for task in self.tasks])
         for number, (task, entry) in enumerate(zip(self.tasks, entries, strict=True)):
             kind, partner = task.teammate_kind, number if self.kind == "informed" else None
-            # A kind of heuristic on several layouts is built without a layout, so that one program covers all of them.
+            # Heuristics of a kind that plays on several layouts are built without a layout, to share one program.
             mate = build_teammate(None if kind in several else task.layout, entry)
             different.append(PlayTask(task.layout, kind, mate, False, self.title, partner, task.task_id))
         return [different[played % len(different)] for played in range(self.options.tasks)]
 
 
-def headroom_jobs(
+def adaptation_jobs(
     sets: Mapping[str, Sequence[Task]], seeds: int, options: ResponseOptions, out: Path
-) -> list[HeadroomJob]:
+) -> list[AdaptationJob]:
     """Return a job for each seed, set of tasks (name -> tasks) and kind of ego, in this order."""
     return [
-        HeadroomJob(tuple(tasks), seed, options, out, title=title, kind=kind)
+        AdaptationJob(tuple(tasks), seed, options, out, title=title, kind=kind)
         for seed in range(seeds)
         for title, tasks in sets.items()
         for kind in EGO_KINDS
     ]
 
 
-def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | None:
+def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any] | None:
     """Return the entry of a set of tasks for cards/adaptation.json; None if no seed has finished jobs of both kinds.
 
     An entry has the training steps, the width of the network, the mean return of each kind of ego for each seed,
@@ -136,7 +136,7 @@ ADAPTATION = "adaptation.json"
 """Name of the file of measured returns, in a folder of training runs and among the package's cards."""
 
 
-def write_adaptation(jobs: Sequence[HeadroomJob], folder: Path) -> Path:
+def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
     """Add the measurements of finished jobs to a folder's file `ADAPTATION`. Return the file's path.
 
     The entry of a set of tasks is replaced, unless the stored entry has more seeds.
@@ -144,7 +144,7 @@ def write_adaptation(jobs: Sequence[HeadroomJob], folder: Path) -> Path:
     path = folder / ADAPTATION
     known = {entry["tasks"]: entry for entry in read_adaptation(folder)}
     for title in dict.fromkeys(job.title for job in jobs):
-        entry = headroom_entry(title, jobs)
+        entry = adaptation_entry(title, jobs)
         if entry and len(known.get(title, entry)["returns"]["informed"]) <= len(entry["returns"]["informed"]):
             known[title] = entry
     with atomic_write(path) as partial:

@@ -28,7 +28,7 @@ import numpy as np
 from icrl4aht_generation.collection.curate import oracle_labels
 from icrl4aht_generation.collection.scripted_rollout import noise_schedules
 from icrl4aht_generation.learners.resume import xla_threads
-from icrl4aht_generation.policy import Policy, sometimes_random
+from icrl4aht_generation.policy import Policy, randomize_action
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from jaxtyping import Array, Float, Int, Int8
 
@@ -110,7 +110,7 @@ def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> P
         label, other = clean, None
         if labeller is not None:
             label, other = labeller.act(params[1], memory.labeller, view, jax.random.fold_in(key, 2))
-        action = sometimes_random(jax.random.fold_in(key, 1), memory.chance, clean).astype(jnp.int32)
+        action = randomize_action(jax.random.fold_in(key, 1), memory.chance, clean).astype(jnp.int32)
         labels = memory.labels.at[memory.steps % length].set(label.astype(jnp.int8))
         return action, NoisyMemory(own, memory.chance, memory.steps + 1, labels, other)
 

@@ -10,14 +10,19 @@ from typing import Any
 import numpy as np
 from icrl4aht_generation.layouts.rearranged import rearranged_layouts, with_four_recipes
 from icrl4aht_generation.policy import Policy
-from icrl4aht_generation.teammates.registry import build_teammate, recover_teammate, with_equal_parameters
+from icrl4aht_generation.teammates.registry import build_teammate, recover_teammate, with_equal_parameter_names
 from icrl4aht_generation.teammates.spread import find_measured
 
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTask, PlayTrainer, make_group, make_play_tasks
 from icrl4aht_baselines.online.teammates import tasks_on_layouts
-from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cell, training_cells
+from icrl4aht_baselines.training.histories import (
+    filter_histories,
+    history_settings,
+    training_record,
+    training_record_entry,
+)
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import TASKS_SOURCE
 from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
@@ -84,7 +89,7 @@ def prepare_play(
         task._replace(searched=task.layout in searched)
         for task in _training_tasks(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
     ]
-    # Actions of the script `search` also count as "oracle", because `search` is an oracle that believes in a recipe.
+    # Actions of `search` are recorded as "oracle" labels too: `search` is the oracle with a guessed recipe.
     labels: Labels | None = "oracle" if play.imitation else None
     about = {
         "model": asdict(model),
@@ -147,7 +152,7 @@ def _task_teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammate
             else:
                 scripted.append((layout, task_id, teammate))
     # All heuristics of a family share one compiled program, so they need the same parameter names.
-    entries = with_equal_parameters([teammate for _, _, teammate in scripted])
+    entries = with_equal_parameter_names([teammate for _, _, teammate in scripted])
     for (layout, task_id, teammate), entry in zip(scripted, entries, strict=True):
         mates = found.setdefault((layout, teammate["family"]), {})
         mates[task_id] = build_teammate(None, entry)
@@ -187,7 +192,7 @@ def _training_tasks(
             other, (kind, mates) = with_four_recipes(layout), next(iter(kinds.items()))
             everywhere[other, kind] = mates
             shares[other.name] = FOUR_RECIPES_SHARE
-            # Indicators are hidden by the name of the layout, and this version of the layout has another name.
+            # `hidden` contains names of layouts, and the version with four recipes has a name of its own.
             hidden += [other.name] * (layout.name in hidden)
     # Rearranged versions get a fixed part of the tasks; the other layouts divide the rest by their shares.
     total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
@@ -255,8 +260,8 @@ def _rearranged_tasks(
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
     """Return the relative number of tasks on each layout: 1, or `FLAT_SHARE` if the oracle earns no more than `stay`.
 
-    The value is 1 if the oracle earns more than `stay` with at least one of the layout's teammates, according to stored
-    measurements, or if a teammate was not measured.
+    A layout gets 1 if stored measurements show that the oracle earns more than `stay` with one of its teammates, or if
+    one of its teammates was not measured.
     """
     matters: dict[str, bool] = defaultdict(bool)
     for task in tasks:
@@ -272,19 +277,19 @@ def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
 def _training_record(
     dataset: Dataset | None, tasks: Sequence[Task], played: set[str], labels: Labels | None
 ) -> list[dict[str, Any]]:
-    """Return the record of training data for the tasks that are played; see `training_cells`.
+    """Return the record of training data for the tasks that are played; see `training_record`.
 
     The entries of tasks without histories have the source `TASKS_SOURCE`.
     """
     found = []
     if dataset is not None:
         of_played = np.isin(dataset.column("task_id"), sorted(played))
-        found = training_cells(dataset.select(of_played), labels) if of_played.any() else []
+        found = training_record(dataset.select(of_played), labels) if of_played.any() else []
     of_cell = grouped(
         (task for task in tasks if task.task_id in played),
         lambda task: (task.layout.name, task.split, task.teammate_family, task.teammate_kind),
     )
     for cell, own in of_cell.items():
         ids, mates = [task.task_id for task in own], sorted({teammate_id(task.teammate) for task in own})
-        found.append(training_cell((*cell, TASKS_SOURCE), labels, ids, 0, mates))
+        found.append(training_record_entry((*cell, TASKS_SOURCE), labels, ids, 0, mates))
     return found

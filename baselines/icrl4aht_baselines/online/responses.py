@@ -36,13 +36,13 @@ from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_data.benchmark.best_responses import (
     BestResponse,
     BestResponseCard,
-    TrainedResponse,
-    chosen_training,
+    TrainingRun,
+    best_training_run,
     read_best_responses,
     write_best_responses,
 )
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LAYOUT_NAMES, LEAST_HEADROOM, TESTED_ON
-from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
+from icrl4aht_data.benchmark.reference_returns import has_headroom, read_reference_returns
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import unknown_name
 from icrl4aht_data.utils.files import json_hash, parse_json, read_text
@@ -98,7 +98,7 @@ def tasks_with_headroom(tasks: Iterable[Task]) -> list[Task]:
 
     Tasks without a measurement, such as those of the track `preference`, are included.
     """
-    cells = read_headroom(PROTOCOL)
+    cells = read_reference_returns(PROTOCOL)
     kept = []
     for task in tasks:
         if task.split == "test":
@@ -210,7 +210,7 @@ class ResponseJob(EgoJob):
             if self.options.init not in models:
                 raise unknown_name("bundled model", self.options.init, models)
             model = models[self.options.init]
-            params = read_trained(model.runs[model.track_on(task.layout.name)]).params
+            params = read_trained(model.runs[model.run_key(task.layout.name)]).params
         mate = build_teammate(task.layout, task.teammate)
         played = PlayTask(task.layout, task.teammate_kind, mate, False, task.layout.name)
         trainer, params = self.train([played] * self.options.tasks, on_update, params)
@@ -234,11 +234,11 @@ class ResponseJob(EgoJob):
         return round(float(np.mean([result.returns for result in results])), 3)
 
 
-def trained_response(job: ResponseJob) -> TrainedResponse:
-    """Return the record of a finished training run, for the play mode that earns more with `CHOICE_SEEDS`."""
+def trained_response(job: ResponseJob) -> TrainingRun:
+    """Return the result of a finished job, for the play mode with the higher return in episodes with `CHOICE_SEEDS`."""
     result = job.result()
     acting, earned = max(result["modes"].items(), key=lambda mode: mode[1]["choice"])
-    return TrainedResponse(
+    return TrainingRun(
         seed=job.seed,
         steps=job.options.updates * job.options.steps_per_update,
         width=job.options.width,
@@ -250,7 +250,7 @@ def trained_response(job: ResponseJob) -> TrainedResponse:
     )
 
 
-def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainedResponse]) -> BestResponse:
+def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainingRun]) -> BestResponse:
     """Return the best response to tasks whose teammates behave the same, from several training runs.
 
     The run with the highest mean return in episodes with the seeds `CHOICE_SEEDS` is chosen. The result's field `best`
@@ -258,7 +258,7 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainedRespo
     initial model, steps and width, only the last is used.
     """
     task, seeds = tasks[0], {(one.init, one.steps, one.width, one.seed): one for one in trainings}
-    best = chosen_training(seeds.values())
+    best = best_training_run(seeds.values())
     return BestResponse(
         layout=task.layout.name,
         family=task.teammate_family,
@@ -271,7 +271,7 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainedRespo
 
 
 def include_models(found: BestResponse, models: Mapping[str, Mapping[str, float]]) -> BestResponse:
-    """Return a best response, with the best of some models in place of the trained ego if this model earns more.
+    """Replace the trained ego of a best response by the model with the highest return, if this model earns more.
 
     Args:
         found: best response with a trained ego.
@@ -323,7 +323,7 @@ def responses_table(folder: Path) -> str:
     """
     body = []
     for one in read_best_responses(folder / RESPONSES_FILE).behaviours:
-        returns, best = [seed.mean_return for seed in one.seeds], chosen_training(one.seeds)
+        returns, best = [seed.mean_return for seed in one.seeds], best_training_run(one.seeds)
         numbers = ", ".join(task.rsplit("_", 3)[1] for task in one.tasks)
         spread = f"{min(returns):.1f} to {max(returns):.1f}" if len(returns) > 1 else ""
         training = [str(len(returns)), f"{best.steps:,}", str(best.width), f"{best.slope or 0.0:+.1f}"]

@@ -71,12 +71,12 @@ class PlayerMemory(NamedTuple):
 
 
 class PlayState(NamedTuple):
-    """State of a training run by playing, which is the complete content of a checkpoint.
+    """State of a training run that plays its own episodes. A checkpoint contains exactly this state.
 
     Attributes:
         params: pytree of float32 arrays.
         optimizer: state of the optimizer.
-        tasks: state of the running tasks, for each player.
+        tasks: states of the running tasks, one entry for each `_Player`.
         step: int32 (), number of training steps so far.
     """
 
@@ -111,7 +111,7 @@ class PlayTask(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Log name that all tasks with this label and kind of teammate share."""
+        """Name in the log, which all tasks with this label and kind of teammate share."""
         return f"{self.label} {self.family}"
 
 
@@ -176,7 +176,7 @@ class _Network(NamedTuple):
 
 
 class _Player:
-    """Player of tasks in one compiled program; all teammates must have the same functions."""
+    """Plays the tasks that share one compiled program; their teammates must have the same functions."""
 
     def __init__(self, tasks: Sequence[PlayTask], method: Method, play: PlayOptions, mirror: bool) -> None:
         self.tasks, self._method, self._play, self._mirror = tasks, method, play, mirror
@@ -262,7 +262,7 @@ class _Player:
         env, change = self.rollout.env, state.ego.change
         record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))
         taken, theirs = actions[..., EGO], actions[..., TEAMMATE]
-        # The inputs also include the next step after the played steps; its value bootstraps the return.
+        # The inputs also include the step that follows the played steps; its value bootstraps the return.
         look = partial(observe, agent=EGO, canonical=True)
         seen_records = jnp.concatenate([played.record, after.env.record[:, None]], axis=1)
         steps = StepInput(
@@ -299,7 +299,7 @@ class _Player:
 
 
 def make_players(tasks: Sequence[PlayTask], method: Method, play: PlayOptions, mirror: bool) -> list[_Player]:
-    """Return players; all tasks that can share a compiled program have the same player."""
+    """Return one player for each group of tasks that can share a compiled program."""
 
     def program(task: PlayTask) -> tuple[Any, ...]:
         mate = task.teammate
@@ -313,7 +313,7 @@ def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"])
     """Return steps with changed observations, and with previous actions converted to the changed view.
 
     Args:
-        change: changes of the observations, (*B,), or with only the last axes of *B if all steps have equal changes.
+        change: changes of the observations, of shape (*B,); leading axes of *B may be left out if changes are equal.
         steps: steps with the environment's observations (*B, ..).
         started: whether each step has a previous step in its task; if not, previous actions are fillers and stay 0.
     """

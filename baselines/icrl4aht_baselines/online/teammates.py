@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from icrl4aht_generation.policy import Policy, sometimes_random
+from icrl4aht_generation.policy import Policy, randomize_action
 
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
@@ -61,7 +61,7 @@ def tasks_on_layouts(tasks: Sequence[Task], layouts: Sequence[Layout]) -> list[T
 
 
 def mixed_chances(tasks: int) -> np.ndarray:
-    """Return the probabilities of the teammates' behaviours according to `MIXTURE`, float32 (tasks, 4)."""
+    """Return the probabilities of the teammates' behaviours according to `MIXTURE`, of shape (tasks, 4)."""
     shares = np.cumsum([share for share, _ in MIXTURE])
     kind = np.searchsorted(shares, (np.arange(tasks) + 0.5) / tasks * shares[-1])
     return np.array([chances for _, chances in MIXTURE], np.float32)[kind]
@@ -72,7 +72,7 @@ def with_behaviours(teammates: Sequence[Policy], chances: np.ndarray) -> list[Po
 
     Args:
         teammates: scripted policies of one family, which share their functions.
-        chances: float32 (len(teammates), 4), probabilities of `BEHAVIOURS`.
+        chances: probabilities of `BEHAVIOURS`, float32, of shape (len(teammates), 4).
     """
     init, act = _behaviour_functions(teammates[0].init, teammates[0].act)
     return [
@@ -98,7 +98,7 @@ def _behaviour_functions(script_init: Callable[..., Any], script_act: Callable[.
     def act(params: Any, memory: tuple[jax.Array, Any], view: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
         behaviour, script = memory
         action, script = script_act(params["script"], script, view, key)
-        action = sometimes_random(jax.random.fold_in(key, 1), noise[behaviour], action)
+        action = randomize_action(jax.random.fold_in(key, 1), noise[behaviour], action)
         return jnp.where(behaviour == BEHAVIOURS.index("stay"), STAY, action).astype(jnp.int32), (behaviour, script)
 
     return init, act

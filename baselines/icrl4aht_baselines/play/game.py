@@ -51,7 +51,7 @@ class PolicyPlayer:
 
     Args:
         policy: the policy.
-        layout: layout of the game; the two agents are exchanged if an ego plays agent 1.
+        layout: layout of the game; the agents' start cells are exchanged if an ego plays agent 1.
         slot: 0 or 1, number of the agent that the policy plays.
         is_ego: whether the policy is an ego, which always sees itself as agent 0 and keeps its memory between episodes.
             A test teammate sees the unchanged state, and starts each episode with a new memory.

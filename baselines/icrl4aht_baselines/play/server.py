@@ -39,7 +39,7 @@ HOST = "127.0.0.1"
 SHOWN_EGOS = ("stay", "rl2-reference", "oracle")
 """Names of the egos that the page compares a person with."""
 
-_ALL_CONNECTED = 4000  # code that closes a websocket if all people of the game are already connected
+_ALL_CONNECTED = 4000  # websocket close code: everyone who plays is already connected
 
 
 def how_to_play(layout: Layout) -> str:
@@ -248,7 +248,7 @@ class PlaySession:
             await self.advance()
 
 
-def play_page(layout: Layout) -> str:
+def game_page(layout: Layout) -> str:
     """Return the HTML page of the game."""
     own = Path(__file__).parent
     text = {name: (own / f"page.{name}").read_text(encoding="utf-8") for name in ("html", "css", "js")}
@@ -261,7 +261,7 @@ def make_app(session: PlaySession) -> Starlette:
     """Return the web application, which also runs the session's game."""
 
     async def page(request: Request) -> HTMLResponse:
-        return HTMLResponse(play_page(session.game.layout), headers={"Cache-Control": "no-store"})
+        return HTMLResponse(game_page(session.game.layout), headers={"Cache-Control": "no-store"})
 
     @asynccontextmanager
     async def running(app: Starlette) -> AsyncIterator[None]:

@@ -22,7 +22,7 @@ from icrl4aht_baselines.report.results import (
     AgentReturns,
     ResultCell,
     as_run,
-    mean_of,
+    mean_over_cells,
     returns_by_cell,
     sorted_cells,
 )
@@ -36,14 +36,14 @@ from icrl4aht_baselines.report.scores import (
     known_headroom,
     score_difference,
 )
-from icrl4aht_baselines.report.statistics import MeanInterval, holm
+from icrl4aht_baselines.report.statistics import MeanInterval, holm_corrected
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission
 from icrl4aht_baselines.training.seen import overlap_legend, overlap_marks
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
-from icrl4aht_data.benchmark.reference_returns import REFERENCES, read_headroom
+from icrl4aht_data.benchmark.reference_returns import REFERENCES, read_reference_returns
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.plotting import legend_below, return_limits, save_figure
+from icrl4aht_data.plotting import add_legend_below, axis_limits, save_figure
 from icrl4aht_data.reading.arrow_tables import import_pyarrow
 from icrl4aht_data.utils.files import atomic_write, write_json
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
@@ -72,7 +72,7 @@ class StoredResults:
     agents: dict[str, AgentFacts] = field(default_factory=dict)
 
     def returns(self, control: str = "") -> dict[str, AgentReturns]:
-        """Return the results of each agent on the test tasks under the protocol of the page, in the order of `agents`.
+        """Return agents' results on the test tasks under the protocol of docs/results.md, in the order of `agents`.
 
         Args:
             control: "cleared" or "swapped", see `protocols.CONTROLS`, or another play mode, see `OTHER_WAYS`; empty for
@@ -84,7 +84,7 @@ class StoredResults:
         return {agent: returns_by_cell(found[agent]) for agent in [*self.agents] if agent in found}
 
     def with_other_play_modes(self, results: Mapping[str, AgentReturns]) -> dict[str, AgentReturns]:
-        """Return results; the results of an agent's other play mode, such as "rl2 (greedy)", follow the agent's own."""
+        """Return `results`, with those of an agent's other play mode, such as "rl2 (greedy)", after the agent's own."""
         others, found = {way: self.returns(way) for way in OTHER_WAYS}, {}
         for agent, own in results.items():
             found[agent] = own
@@ -130,7 +130,7 @@ def write_stored(path: Path, stored: StoredResults) -> None:
 
 
 def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
-    """Check that `Submission.update` is set exactly if the submission's agent is already stored.
+    """Check that `Submission.update` is set if the submission's agent is already stored, and only then.
 
     Raises:
         OptionError: if `Submission.update` is set for an agent that is not stored, or not set for a stored agent.
@@ -194,7 +194,7 @@ def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
 
 
 def render_comparison(stored: StoredResults) -> str:
-    """Return the text of docs/results.md. Tables leave out agents that the current code cannot make."""
+    """Return the text of docs/results.md. Tables leave out agents of older code, see `AgentFacts.commit`."""
     scales, every = cell_scales(SUBMITTED_PROTOCOL), stored.returns()
     results = {agent: cells for agent, cells in every.items() if not stored.agents[agent].commit}
     overlaps = {name for cells in results.values() for returns in cells.values() for name in returns.overlaps}
@@ -269,9 +269,9 @@ def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return table 2: benefit M of memory, benefit P of the right context, and mean returns in blocks of episodes.
 
-    The rows are those of table 1. Means are over the combinations of layout and family that have headroom, or over all
-    that the agent played if none is known to have headroom. M and P are bold if they are above 0 with a p-value below
-    0.05, corrected for all tests in the table.
+    The rows are those of table 1. Means are over the combinations of layout and family that the agent played and that
+    have headroom, or over all that it played if none of them has headroom. M and P are bold if they are above 0 with a
+    p-value below 0.05, corrected for all tests in the table.
     """
     chosen = {agent: _controlled_cells(cells, scales) for agent, cells in results.items()}
     found = {
@@ -280,7 +280,7 @@ def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], s
         for others in [stored.returns(control)]
         for agent, cells in results.items()
     }
-    corrected = holm({key: difference.p for key, difference in found.items() if difference})
+    corrected = holm_corrected({key: difference.p for key, difference in found.items() if difference})
     body = []
     for agent, cells in results.items():
         row = [f"`{agent}`"]
@@ -290,7 +290,7 @@ def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], s
             row.append(f"**{text}**" if is_clear else text)
         for block in EPISODE_BLOCKS:
             parts = [cells[cell].blocks[block] for cell in chosen[agent] if block in cells[cell].blocks]
-            row.append(f"{mean_of(parts):z.1f}" if parts else "–")
+            row.append(f"{mean_over_cells(parts):z.1f}" if parts else "–")
         body.append(row)
     return markdown_table(["model", "M", "P", *EPISODE_BLOCKS], body, right=len(EPISODE_BLOCKS))
 
@@ -315,12 +315,16 @@ def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, s
 
 
 def mean_best_return(layout: str, scales: CellScales) -> float | None:
-    """Return the mean return of the best responses to a layout's families; None if no family has a best response.
+    """Return the mean return of the best responses to the teammate families on a layout; None without best responses.
 
-    For a family without a best response, the return of `stay` is used, because the oracle earns no more with this
-    family, see `scores.cell_scales`.
+    For a family without a best response, the return of `stay` is used, because the oracle earns at most 1 more than
+    `stay` with this family, see `scores.cell_scales`.
     """
-    cells = {ResultCell(*cell): egos for cell, egos in read_headroom(SUBMITTED_PROTOCOL).items() if cell[0] == layout}
+    cells = {
+        ResultCell(*cell): egos
+        for cell, egos in read_reference_returns(SUBMITTED_PROTOCOL).items()
+        if cell[0] == layout
+    }
     if not cells.keys() & scales.keys():
         return None
     return float(np.mean([scales[cell].best if cell in scales else egos["stay"] for cell, egos in cells.items()]))
@@ -331,7 +335,7 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 
     The first rows show the reference egos and the best responses.
     """
-    scored, headroom = cells_with_headroom(scales), read_headroom(SUBMITTED_PROTOCOL)
+    scored, headroom = cells_with_headroom(scales), read_reference_returns(SUBMITTED_PROTOCOL)
     body = []
     for ego in REFERENCES:
         means = (np.mean([egos[ego] for cell, egos in headroom.items() if cell[0] == name]) for name in TEST_LAYOUTS)
@@ -343,7 +347,7 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
         for name in TEST_LAYOUTS:
             played = [of.mean for cell, of in cells.items() if cell.layout == name]
             score = find_score(cells, [cell for cell in scored if cell.layout == name], scales)
-            text = f"{mean_of(played):z.1f}" if played else "–"
+            text = f"{mean_over_cells(played):z.1f}" if played else "–"
             texts.append(f"{text} ({score.total.mean:z.2f})" if score else text)
         score = find_score(cells, [cell for cell in scored if cell in cells], scales)
         worst = f"{score.worst[1]:z.2f}, {score.worst[0]}" if score else "–"
@@ -352,7 +356,7 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 
 
 def describe_training_runs() -> str:
-    """Return sentences on how the best responses were trained, or an empty string if there are none."""
+    """Return sentences on how the best responses were trained; an empty string without best responses."""
     behaviours = read_best_responses().behaviours
     trained = [training for one in behaviours for training in one.seeds]
     if not trained:
@@ -381,7 +385,11 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
     Each of the first six layouts with headroom has a panel. An agent without stored curves has a point at the first
     episode. Horizontal lines show `stay` and best responses.
     """
-    scales, results, headroom = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), read_headroom(SUBMITTED_PROTOCOL)
+    scales, results, headroom = (
+        cell_scales(SUBMITTED_PROTOCOL),
+        stored.returns(),
+        read_reference_returns(SUBMITTED_PROTOCOL),
+    )
     cells = sorted_cells(cell for cell, has_any in known_headroom(SUBMITTED_PROTOCOL).items() if has_any)
     layouts = list(dict.fromkeys(cell.layout for cell in cells))[:_PANELS]
     figure, grid = panel_grid(layouts, 3, (3.6, 3), "episode")
@@ -399,15 +407,17 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
                     axes.plot(np.arange(1, len(curve) + 1), curve, style, color=color, linewidth=1.2, label=label)
             first = [of.blocks["1"] for cell, of in results[agent].items() if cell.layout == layout]
             if first and (agent, "", layout) not in curves:
-                axes.plot([1], [mean_of(first)], "o", color=color, markersize=4, label=f"{agent}, first episode")
+                axes.plot(
+                    [1], [mean_over_cells(first)], "o", color=color, markersize=4, label=f"{agent}, first episode"
+                )
         stays = [egos["stay"] for cell, egos in headroom.items() if cell[0] == layout]
         axes.axhline(np.mean(stays), color="gray", linestyle=":", label="stay")
         if (best := mean_best_return(layout, scales)) is not None:
             axes.axhline(best, color="black", label="best response")
-        axes.set_ylim(*return_limits(value for line in axes.lines for value in np.ravel(line.get_ydata())))
+        axes.set_ylim(*axis_limits(value for line in axes.lines for value in np.ravel(line.get_ydata())))
         axes.set_xscale("log")
         axes.set_xlim(0.9, 110)
         axes.set_xticks([1, 2, 5, 10, 20, 50, 100], ["1", "2", "5", "10", "20", "50", "100"])
     grid[0].set_ylabel("return of an episode", fontsize=8)
-    legend_below(figure)
+    add_legend_below(figure)
     save_figure(figure, path)

@@ -14,17 +14,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_baselines.report.results import TASK_KINDS, EvaluationRun, ResultCell, family_title, mean_of, sorted_cells
+from icrl4aht_baselines.report.results import (
+    TASK_KINDS,
+    EvaluationRun,
+    ResultCell,
+    family_title,
+    mean_over_cells,
+    sorted_cells,
+)
 from icrl4aht_baselines.report.scores import cell_scales, find_score, scored_cells
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
-from icrl4aht_data.plotting import return_limits, running_mean
+from icrl4aht_data.plotting import axis_limits, running_mean
 
 SMOOTHING = 10
 """Largest number of episodes in a curve's running mean; shorter curves use a tenth of their episodes."""
 
-# Scores beyond these limits are clipped; they occur where a best response earns little more than `stay`.
+# Scores beyond these limits are clipped. Such scores occur where a best response earns little more than `stay`.
 _SCORE_LIMITS = (-0.5, 1.5)
 _TICKS = 5
 _DRAWING = 1000  # units of a panel's width and height
@@ -126,7 +133,7 @@ def bar_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
             for number, run in shown.items()
         }
         if any(values.values()) and not (kind == "test" and charts):
-            scale = _Scale(*return_limits(found.mean for of_run in values.values() for found in of_run.values()))
+            scale = _Scale(*axis_limits(found.mean for of_run in values.values() for found in of_run.values()))
             charts.append(_bar_chart(f"Return in each cell, {kind} tasks", shown, values, scale, about))
     return charts
 
@@ -188,7 +195,7 @@ def _make_bar(
     zero, end = scale.position(0), scale.position(found.mean)
     clipped = "" if scale.low <= found.mean <= scale.high else "*"
     text = f"{found.mean:z.{digits}f}{clipped}{overlap_marks(returns.overlaps).strip()}"
-    tooltip = f"{run.label}: {found.text(digits)}, return {mean_of([returns.mean]):z.1f}"
+    tooltip = f"{run.label}: {found.text(digits)}, return {mean_over_cells([returns.mean]):z.1f}"
     interval = (scale.position(found.low), scale.position(found.high)) if found.range() else None
     return Bar(number, min(zero, end), abs(end - zero), interval, text, tooltip)
 
@@ -201,9 +208,9 @@ def _labelled_series(runs: NumberedRuns, cells: Sequence[ResultCell]) -> list[tu
 
 
 def curve_charts(runs: NumberedRuns) -> list[Chart]:
-    """Return a chart of returns per episode for each kind of tasks and layout, with a panel for each family.
+    """Return a chart for each kind of task and layout, with a panel of returns per episode for each teammate family.
 
-    Lines are running means of the mean over all instances; bands are the range of the instances' running means.
+    Lines show running means, averaged over the tasks. Bands show the range of the single tasks' running means.
     """
     charts = []
     cells = sorted({cell for run in runs.values() for cell in run.cells}, key=lambda cell: (cell.order[-1], cell.order))
@@ -221,7 +228,7 @@ def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) ->
         for key, of_cell in raw.items()
     }
     drawn = [*smooth.values(), *(of_cell.mean(axis=0) for of_cell in raw.values())]
-    y = _Scale(*return_limits(float(value) for found in drawn for value in found.flat))
+    y = _Scale(*axis_limits(float(value) for found in drawn for value in found.flat))
     episodes = max(returns.shape[1] for returns in raw.values())
     x = _Scale(1, max(2, episodes))
     panels = {

@@ -106,7 +106,7 @@ def family_gifs(
         ordered = sorted(run.cells, key=lambda cell: (cell.order[1:], not headroom.get(cell)))
         chosen += [(run, cells[0]) for cells in grouped(ordered, lambda cell: cell[1:]).values()]
     advance = bar_updater(progress, "episodes of the report", len(chosen))
-    with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes most of the time
+    with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # threads compile in parallel
         drawn = [pool.submit(_draw_result, *each, folder / str(number), suite) for number, each in enumerate(chosen)]
         for _ in as_completed(drawn):
             advance(1)
@@ -123,7 +123,7 @@ def _draw_result(run: EvaluationRun, cell: ResultCell, prefix: Path, suite: Path
     try:
         paths = {number: prefix.with_name(f"{prefix.name}-{number}.gif") for number in (1, protocol.episodes)}
         if source.detail("swapped"):
-            raise OptionError("another teammate played the earlier episodes")
+            raise OptionError("the control swapped has no GIFs, because another teammate played the earlier episodes")
         ego, forget = restore_ego(source), bool(source.detail("forget"))
         shown = save_episodes(paths, task, ego, protocol, seed=seed, cell=24, suite=suite, forget=forget)
         return EpisodePair(cell, title, origin, shown)

@@ -35,7 +35,7 @@ from icrl4aht_baselines.report.results import (
 from icrl4aht_baselines.report.scores import (
     add_scales,
     blocks_text,
-    bundled_cells,
+    bundled_ids_by_cell,
     cell_scales,
     find_headlines,
     find_score,
@@ -43,7 +43,7 @@ from icrl4aht_baselines.report.scores import (
     scored_cells,
 )
 from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend, overlap_marks
-from icrl4aht_data.benchmark.facts import TRACKS, family_order
+from icrl4aht_data.benchmark.facts import TRACKS, family_sort_key
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
 from icrl4aht_data.utils.files import json_hash, parse_json, read_text, write_atomically
 from icrl4aht_data.utils.templates import card_file, markdown_table
@@ -104,7 +104,7 @@ def table_score(
     means = [of.mean.mean(axis=1) for of in returns]
     values = means[0] if len(cells) == 1 else np.array([of_cell.mean() for of_cell in means])
     std = f" ± {values.std():z.1f}" if len(values) > 1 else ""
-    instances = {cell: len(bundled_cells()[cell]) for cell in played if cell.kind == "test"}
+    instances = {cell: len(bundled_ids_by_cell()[cell]) for cell in played if cell.kind == "test"}
     complete = all(len(run.tasks(cell)) == count for cell, count in instances.items())
     counts = f"{len(means[0])} of {counted_noun(instances.get(cells[0], 0), 'instance')}"
     score, overlaps = find_score(run.returns, scored_cells(run, played, scales), scales), run.overlaps(played)
@@ -140,7 +140,7 @@ class ScoreTable(NamedTuple):
 
 
 def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTable]:
-    """Return a table of returns for each kind of tasks that was played.
+    """Return a table of returns for each kind of task that was played.
 
     Tables of test tasks also have averages. Under the paper's protocol they have rows with the paper's results of AD,
     DPT and `random`.
@@ -155,7 +155,7 @@ def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTa
         if not cells:
             continue
         layouts = tuple(dict.fromkeys(cell.layout for cell in cells))
-        families = tuple(sorted({cell.family for cell in cells}, key=family_order))
+        families = tuple(sorted({cell.family for cell in cells}, key=family_sort_key))
         columns, labels = ({name: (name,) for name in names} for names in (layouts, families))
         if kind == "test":
             columns |= {AVERAGE: layouts} if len(layouts) > 1 else {}
@@ -183,7 +183,7 @@ def read_published() -> dict[str, Any]:
 
 
 def published_cells(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
-    """Return layout -> family or "Average" -> published (mean, std); empty for an agent that is not in the paper."""
+    """Return an agent's (mean, std) in the paper by layout and by family or "Average"; empty for other agents."""
     return read_published()["methods"].get(agent, {})
 
 
@@ -211,9 +211,10 @@ def published_score(agent: EvaluationRun | str, cells: Sequence[ResultCell]) -> 
 
 
 def describe_conditions(runs: Iterable[EvaluationRun], cells: Container[ResultCell] | None = None) -> str:
-    """Return a sentence with the protocol, seeds, episodes and number of tasks of some runs, or of given `cells` only.
+    """Return a sentence with the protocol, seeds, episodes and number of tasks per cell of some runs.
 
-    If the conditions differ between runs, the sentence names the agents of each condition.
+    If the conditions differ between runs, the sentence names the runs under each condition. If `cells` is given, only
+    results in these cells are described.
     """
     shown = [(run, cell) for run in runs for cell in run.cells if cells is None or cell in cells]
     labels: dict[str, dict[str, None]] = {}
@@ -226,7 +227,7 @@ def describe_conditions(runs: Iterable[EvaluationRun], cells: Container[ResultCe
 
 
 def instances_range(numbers: Iterable[int]) -> str:
-    """Return a range of numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
+    """Return text with the range of some counts of instances, such as "5 instances" or "1 to 5 instances"."""
     found = sorted(set(numbers))
     return counted_noun(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
 
@@ -257,7 +258,7 @@ def markdown(runs: Sequence[EvaluationRun]) -> str:
 
 
 def markdown_sections(runs: Sequence[EvaluationRun], protocol: str) -> list[str]:
-    """Return a Markdown section for each kind of tasks that was played: a table and its legend."""
+    """Return a Markdown section for each kind of task that was played: a table and its legend."""
     sections = []
     for table in returns_tables(runs, protocol):
         body = [
@@ -369,7 +370,7 @@ def _page_values(
 
 
 def _settings_table(runs: Sequence[EvaluationRun]) -> dict[str, list[str]]:
-    """Return name of a setting of evaluation or training -> its value in each source of results, as text."""
+    """Return the settings of evaluation and training: name -> its values as text, one for each source of results."""
     columns = []
     for label, source in [(run.label, source) for run in runs for source in run.sources]:
         shown = {"agent": label, "layouts": ", ".join(source.layouts), "results": source.folder}

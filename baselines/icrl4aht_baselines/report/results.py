@@ -32,7 +32,7 @@ from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, Protocol, b
 from icrl4aht_baselines.evaluate.results import RESULTS, Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_baselines.training.seen import TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on, sorted_overlaps
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, PREFERENCE, TRACKS, family_order, layout_order, track_of
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, PREFERENCE, TRACKS, family_sort_key, layout_sort_key, layout_track
 from icrl4aht_data.benchmark.tasks import Task, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, read_tasks_and_layouts, write_layouts_file
@@ -102,7 +102,7 @@ class ResultCell(NamedTuple):
     @property
     def order(self) -> tuple[Any, ...]:
         """Sort key that orders layouts and families as in the paper."""
-        return layout_order(self.layout), family_order(self.family), list(TASK_KINDS).index(self.kind)
+        return layout_sort_key(self.layout), family_sort_key(self.family), list(TASK_KINDS).index(self.kind)
 
 
 class CellReturns(NamedTuple):
@@ -111,7 +111,7 @@ class CellReturns(NamedTuple):
     Attributes:
         tasks: labels of the tasks, see `task_label`.
         seeds: seeds of the episodes.
-        blocks: block of episodes -> mean returns, float64 (T, U, S), see `BLOCKS`.
+        blocks: block of episodes, see `BLOCKS` -> mean returns, float64 of shape (T, U, S).
         overlaps: kinds of overlap of the tasks with the training data.
         trainings: numbers of the agent's training runs.
     """
@@ -124,11 +124,11 @@ class CellReturns(NamedTuple):
 
     @property
     def mean(self) -> np.ndarray:
-        """Mean returns over all episodes and training runs, float64 (U, S)."""
+        """Mean returns over all episodes and training runs, float64 of shape (U, S)."""
         return self.blocks["all"].mean(axis=0)
 
 
-def mean_of(cells: Iterable[np.ndarray]) -> float:
+def mean_over_cells(cells: Iterable[np.ndarray]) -> float:
     """Return the mean of the means of several result cells."""
     return float(np.mean([values.mean() for values in cells]))
 
@@ -138,7 +138,7 @@ AgentReturns = Mapping[ResultCell, CellReturns]
 
 
 def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
-    """Return result cell -> returns, in the paper's order, from a table with one agent, control and protocol."""
+    """Return the returns in each result cell, in the paper's order, from a table of one agent, control and protocol."""
     found = {}
     for key, rows in table.groupby(CELL_COLUMNS, sort=False):
         codes, axes = zip(*(pd.factorize(rows[name]) for name in ("training", "task", "seed", "block")), strict=True)
@@ -212,7 +212,8 @@ class EvaluationRun:
         agent: name of the agent.
         protocol: name of the protocol.
         table: results as a table; its columns are described at the top of this module.
-        cells: `ResultCell` -> returns averaged over seeds, float64 (tasks, episodes); layouts are in the paper's order.
+        cells: `ResultCell` -> returns averaged over seeds, float64 of shape (tasks, episodes); layouts are in the
+            paper's order.
         note: text that distinguishes several results of one agent in the same result cells; usually empty.
         sources: origins of the results; each result cell has one origin.
     """
@@ -252,7 +253,7 @@ class EvaluationRun:
 
 
 def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
-    """Return name of a block -> mean return in the block, (...), from the returns of all episodes, (..., episodes)."""
+    """Return the mean return in each block of episodes, by block name, from returns of shape (..., episodes)."""
     episodes = returns.shape[-1]
     return {
         name: returns[..., start:stop].mean(axis=-1) for name, (start, stop) in BLOCKS.items() if episodes > abs(start)
@@ -279,7 +280,7 @@ def write_run_and_tasks(results: Path, run: Path | None = None, tasks: Sequence[
         }
         with atomic_write(results / TRAINED_RUN) as partial:
             write_json(partial, content)
-    own = {task.task_id: task for task in tasks if task.task_id not in bundled_by_id("test")}
+    own = {task.task_id: task for task in tasks if task.task_id not in bundled_tasks_by_id("test")}
     if own:
         path = results / OWN_TASKS
         known = {task.task_id: task for task in read_tasks_and_layouts(path)} if path.exists() else {}
@@ -356,7 +357,7 @@ def as_run(
     settings = results[0].settings
     if any(result.settings != settings for result in results):
         raise OptionError(f"{where}: expected results with equal settings, found different settings; evaluate again")
-    known = {key: task for split in EVALUATION_SPLITS for key, task in bundled_by_id(split).items()}
+    known = {key: task for split in EVALUATION_SPLITS for key, task in bundled_tasks_by_id(split).items()}
     known |= {task.task_id: task for task in tasks}
     if missing := [result.task_id for result in results if result.task_id not in known]:
         raise OptionError(
@@ -369,7 +370,7 @@ def as_run(
     rows, cells, tracks = [], {}, defaultdict(dict)
     for cell in sorted_cells(played):
         of_cell = tuple(known[result.task_id] for result in played[cell])
-        track = "" if "" in seen else track_of(cell.layout)
+        track = "" if "" in seen else layout_track(cell.layout)
         returns = np.array([result.returns for result in played[cell]], np.float64)  # (tasks, seeds, episodes)
         cells[cell], tracks[track][cell] = returns.mean(axis=1), of_cell
         overlaps, names = find_overlaps(of_cell, seen[track]), [task_label(task.task_id) for task in of_cell]
@@ -384,7 +385,7 @@ def as_run(
 
 
 def find_training_record(settings: dict[str, Any], where: str) -> dict[str, SeenInTraining | None]:
-    """Return track -> layouts and teammates in an agent's training; None if the results do not state them.
+    """Return the layouts and teammates in an agent's training, by track; None where the results do not state them.
 
     The only key is "", unless the agent has a separate model for each track. Reference egos have an empty record.
     """
@@ -426,8 +427,8 @@ def _rule_key(run: EvaluationRun) -> tuple[Any, ...]:
 
 
 @cache
-def bundled_by_id(split: str) -> dict[str, Task]:
-    """Return id -> task for the package's tasks of a split on both tracks; "test" has the 160 published tasks."""
+def bundled_tasks_by_id(split: str) -> dict[str, Task]:
+    """Return the tasks of a split of both benchmark tracks, by task id; split "test" has the 160 published tasks."""
     return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, split)}
 
 
@@ -436,9 +437,9 @@ def cell_of(task: Task) -> ResultCell:
     kind = _KIND_OF_SPLIT[task.split]
     if task.track == PREFERENCE and task.split == "test":
         kind = PREFERENCE
-    elif task.task_id in bundled_by_id("test"):
+    elif task.task_id in bundled_tasks_by_id("test"):
         kind = "test"
-    elif task.task_id in bundled_by_id("diverse"):
+    elif task.task_id in bundled_tasks_by_id("diverse"):
         kind = "diverse"
     return ResultCell(task.layout.name, task.teammate_family, kind)
 

@@ -27,9 +27,9 @@ from icrl4aht_baselines.report.results import (
     CellReturns,
     EvaluationRun,
     ResultCell,
-    bundled_by_id,
+    bundled_tasks_by_id,
     cell_of,
-    mean_of,
+    mean_over_cells,
     sorted_cells,
     task_label,
 )
@@ -43,7 +43,12 @@ from icrl4aht_baselines.report.statistics import (
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.best_responses import best_responses, read_best_responses
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LEAST_HEADROOM, TRACKS
-from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom, same_behaviour_tasks, stay_returns
+from icrl4aht_data.benchmark.reference_returns import (
+    has_headroom,
+    read_reference_returns,
+    same_behaviour_tasks,
+    stay_returns,
+)
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_noun
@@ -93,14 +98,14 @@ CellScales = Mapping[ResultCell, CellScale]
 
 
 @cache
-def bundled_cells() -> dict[ResultCell, list[str]]:
-    """Return result cell -> task ids, for all tasks in the package."""
-    found = grouped([task for split in EVALUATION_SPLITS for task in bundled_by_id(split).values()], cell_of)
+def bundled_ids_by_cell() -> dict[ResultCell, list[str]]:
+    """Return the ids of the test and validation tasks of both benchmark tracks, by result cell."""
+    found = grouped([task for split in EVALUATION_SPLITS for task in bundled_tasks_by_id(split).values()], cell_of)
     return {cell: [task.task_id for task in found[cell]] for cell in sorted_cells(found)}
 
 
 def behaviour_names() -> dict[str, str]:
-    """Return label of a task -> name of its teammate's behaviour.
+    """Return the name of the teammate's behaviour in each task, by task label.
 
     The name of a behaviour is the id of the first task with this behaviour. The result covers the package's test tasks
     and all tasks with best responses.
@@ -110,20 +115,20 @@ def behaviour_names() -> dict[str, str]:
 
 
 def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
-    """Return result cell -> reference returns under a protocol, for cells whose tasks all have best responses.
+    """Return the reference returns of each result cell under a protocol, if all its tasks have best responses.
 
     The test cells of a layout are left out if the layout has a test cell without best responses in which the oracle
-    earns more than `stay`.
+    earns over 1 more than `stay`.
     """
     measured, stays, names = best_responses(protocol), stay_returns(protocol), behaviour_names()
     found: dict[ResultCell, CellScale] = {}
-    for cell, tasks in bundled_cells().items() if measured else ():
+    for cell, tasks in bundled_ids_by_cell().items() if measured else ():
         if all(task in measured and task in stays for task in tasks):
             scales = {
                 task_label(task): TaskScale(stays[task], measured[task].best, names[task_label(task)]) for task in tasks
             }
             found[cell] = CellScale(scales)
-    wanted = (ResultCell(*cell) for cell, egos in read_headroom(protocol).items() if has_headroom(egos))
+    wanted = (ResultCell(*cell) for cell, egos in read_reference_returns(protocol).items() if has_headroom(egos))
     unfinished = {cell.layout for cell in wanted if cell not in found}
     return {cell: scale for cell, scale in found.items() if cell.kind != "test" or cell.layout not in unfinished}
 
@@ -152,8 +157,8 @@ def cells_with_headroom(scales: CellScales, track: str | None = None) -> list[Re
 
 
 def known_headroom(protocol: str) -> dict[ResultCell, bool]:
-    """Return result cell -> whether it has headroom, according to best responses if known, otherwise to the oracle."""
-    egos = {ResultCell(*cell): has_headroom(of_cell) for cell, of_cell in read_headroom(protocol).items()}
+    """Return whether each result cell has headroom, judged by best responses if known, otherwise by the oracle."""
+    egos = {ResultCell(*cell): has_headroom(of_cell) for cell, of_cell in read_reference_returns(protocol).items()}
     return egos | {cell: scale.has_headroom for cell, scale in cell_scales(protocol).items()}
 
 
@@ -192,7 +197,7 @@ def find_score(returns: AgentReturns, cells: Sequence[ResultCell], scales: CellS
     values, labels, regrets = [], [], []
     for cell in cells:
         gains, spans, names = _gains_and_scales(returns[cell], scales[cell])
-        groups[cell.layout].append(behaviour_stratum(gains, spans, names))
+        groups[cell.layout].append(stratum_of_behaviours(gains, spans, names))
         regrets.append(spans - gains.mean(axis=(0, 2)))
         for name in dict.fromkeys(names):
             own = [number for number, other in enumerate(names) if other == name]
@@ -214,7 +219,7 @@ def is_scored(returns: CellReturns | None, scale: CellScale | None) -> bool:
 
 
 def _gains_and_scales(returns: CellReturns, scale: CellScale) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Return the gains of a cell's tasks that have a best response, their scales, and their teammates' behaviours.
+    """Return gains, scales and teammates' behaviours of those tasks of a cell that have a best response.
 
     A gain is the agent's return minus that of `stay`, for each training run, task and seed; a task's scale is the best
     response's return minus that of `stay`.
@@ -225,12 +230,12 @@ def _gains_and_scales(returns: CellReturns, scale: CellScale) -> tuple[np.ndarra
     return returns.blocks["all"][:, known] - stays[:, None], bests - stays, [one.behaviour for one in of_task]
 
 
-def behaviour_stratum(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
-    """Return a stratum of the bootstrap. Its units are behaviours, or seeds if there is a single behaviour.
+def stratum_of_behaviours(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
+    """Return a stratum for the bootstrap, with behaviours as units, or seeds if there is a single behaviour.
 
     Args:
-        values: numerators of the tasks, (T, U, S).
-        scales: denominators of the tasks, (U,).
+        values: numerators of the tasks, of shape (T, U, S).
+        scales: denominators of the tasks, of shape (U,).
         behaviours: name of the teammate's behaviour in each task.
     """
     names, seeds = list(dict.fromkeys(behaviours)), values.shape[2]
@@ -247,7 +252,7 @@ def score_difference(
     groups: dict[str, list[Stratum]] = defaultdict(list)
     for cell in cells:
         first, second = (_gains_and_scales(of, scales[cell]) for of in common_results(one[cell], other[cell]))
-        groups[cell.layout].append(behaviour_stratum(first[0] - second[0], *first[1:]))
+        groups[cell.layout].append(stratum_of_behaviours(first[0] - second[0], *first[1:]))
     return ratio_interval([*groups.values()])
 
 
@@ -271,7 +276,7 @@ def block_difference(
         if block not in first.blocks or block not in second.blocks:
             return None
         names = [alike.get(task, task) for task in first.tasks]
-        groups.append([behaviour_stratum(first.blocks[block] - second.blocks[block], np.ones(len(names)), names)])
+        groups.append([stratum_of_behaviours(first.blocks[block] - second.blocks[block], np.ones(len(names)), names)])
     return ratio_interval(groups) if groups else None
 
 
@@ -310,7 +315,7 @@ def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str
         cells = grouped(of_track, lambda row: (tasks[row].layout.name, tasks[row].teammate_family)).values()
         texts = []
         for values in (results.memory, results.partner):
-            strata = [behaviour_stratum(values[None, own], np.ones(len(own)), names[own].tolist()) for own in cells]
+            strata = [stratum_of_behaviours(values[None, own], np.ones(len(own)), names[own].tolist()) for own in cells]
             texts.append(ratio_interval([[stratum] for stratum in strata]).text(sign="+"))
         memory, partner = texts
         lines += [
@@ -331,7 +336,7 @@ def blocks_text(cells: Sequence[CellReturns]) -> str:
     # Result cells may have different numbers of episodes, so only the episode blocks that every result cell has are
     # shown.
     names = [name for name in EPISODE_BLOCKS if all(name in of.blocks for of in cells)]
-    return ", ".join(f"{name}: {mean_of(of.blocks[name] for of in cells):z.1f}" for name in names)
+    return ", ".join(f"{name}: {mean_over_cells(of.blocks[name] for of in cells):z.1f}" for name in names)
 
 
 class Headline(NamedTuple):
@@ -371,7 +376,7 @@ class Headline(NamedTuple):
 
 
 def find_headlines(run: EvaluationRun) -> list[Headline]:
-    """Return a summary of a run for each kind of tasks that was played, with test tasks first."""
+    """Return a summary of a run for each kind of task that was played, with test tasks first."""
     scales, found = cell_scales(run.protocol), []
     for kind in TASK_KINDS:
         played = [cell for cell in run.returns if cell.kind == kind]
@@ -389,14 +394,14 @@ def find_headlines(run: EvaluationRun) -> list[Headline]:
                 score=find_score(run.returns, scored, scales),
                 mean=mean_interval(*(of.mean for of in returns)),
                 blocks=blocks_text(returns) if min(run.cells[cell].shape[1] for cell in cells) > 1 else "",
-                why_no_score="" if scored else _why_no_score(run, played, scales),
+                why_no_score="" if scored else _missing_score_reason(run, played, scales),
                 overlaps=overlaps,
             )
         )
     return found
 
 
-def _why_no_score(run: EvaluationRun, cells: Sequence[ResultCell], scales: CellScales) -> str:
+def _missing_score_reason(run: EvaluationRun, cells: Sequence[ResultCell], scales: CellScales) -> str:
     measured, known = read_best_responses(), [cell for cell in cells if cell in scales]
     if measured.behaviours and run.protocol != measured.protocol:
         return f"No score: best responses were measured under protocol {measured.protocol}."

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from scipy.stats import bootstrap, trim_mean
 
 _RESAMPLES = 4000
-_LEAST_FREEDOM = 3  # with fewer degrees of freedom, too few resamples differ
+_LEAST_FREEDOM = 3  # with fewer degrees of freedom, too many resamples are equal
 
 _Key = TypeVar("_Key", bound=Hashable)
 
@@ -49,11 +49,11 @@ class MeanInterval(NamedTuple):
 
 
 class Stratum(NamedTuple):
-    """Group within which the bootstrap for the ratio sum(gains) / sum(scales) resamples units, such as teammates.
+    """Group of units, such as teammates, that are resampled in the bootstrap of the ratio sum(gains) / sum(scales).
 
     Attributes:
-        gains: each unit's part of the numerator in each training run, (T, U).
-        scales: each unit's part of the denominator, (U,).
+        gains: each unit's part of the numerator in each training run, of shape (T, U).
+        scales: each unit's part of the denominator, of shape (U,).
     """
 
     gains: Float[np.ndarray, "T U"]
@@ -61,16 +61,17 @@ class Stratum(NamedTuple):
 
 
 def mean_interval(*cells: Float[np.ndarray, "U ..."]) -> MeanInterval:
-    """Return the mean of the means of some result cells, with its interval.
+    """Return the mean over result cells of the mean value in each cell, with its 95 % interval.
 
     Args:
-        cells: values of each result cell, (U,) or (U, S). Values are resampled within a cell; cells are not resampled.
+        cells: values of each result cell, of shape (U,) or (U, S). Values are resampled within a cell; cells are not
+            resampled.
     """
-    return ratio_interval([[mean_stratum(values[None])] for values in cells])
+    return ratio_interval([[stratum_of_values(values[None])] for values in cells])
 
 
-def mean_stratum(values: Float[np.ndarray, "T U ..."]) -> Stratum:
-    """Return a stratum for the mean of some values, (T, U) or (T, U, S), with all denominators 1."""
+def stratum_of_values(values: Float[np.ndarray, "T U ..."]) -> Stratum:
+    """Return a stratum whose ratio is the mean of values of shape (T, U) or (T, U, S); all denominators are 1."""
     values = values.reshape(*values.shape[:2], -1)
     units = values.mean(axis=2) if values.shape[1] > 1 else values[:, 0]
     return Stratum(units, np.ones(units.shape[1]))
@@ -105,17 +106,20 @@ def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMP
 
 
 def _resample(stratum: Stratum, resamples: int, rng: np.random.Generator) -> Stratum:
-    """Return R resamples of a stratum, with gains (R, T, U) and scales (R, U)."""
+    """Return R resamples of a stratum, with gains of shape (R, T, U) and scales of shape (R, U)."""
     units = rng.integers(len(stratum.scales), size=(resamples, len(stratum.scales)))
     return Stratum(stratum.gains[:, units].swapaxes(0, 1), stratum.scales[units])
 
 
 def _estimate(groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R T"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean over groups of the ratio of gains to scales in each resample, and its variance, both (R,).
+    """Return mean and variance of the ratio sum(gains) / sum(scales), averaged over groups, for each resample.
 
     Args:
-        groups: strata with gains (R, T, U) and scales (R, U).
-        weights: share of each training run in each resample, (R, T).
+        groups: strata with gains of shape (R, T, U) and scales of shape (R, U).
+        weights: share of each training run in each resample, of shape (R, T).
+
+    Returns:
+        The means and the variances, both of shape (R,).
     """
     by_training, variance = np.zeros_like(weights), np.zeros(len(weights))
     for group in groups:
@@ -142,14 +146,14 @@ def interquartile_mean(values: Float[np.ndarray, " U"]) -> MeanInterval:
     if len(values) <= _LEAST_FREEDOM:
         return MeanInterval(mean)
     jackknife = [trim_mean(np.delete(values, number), 0.25) for number in range(len(values))]
-    if np.ptp(jackknife) < 1e-9:  # BCa divides by the variance of these means
+    if np.ptp(jackknife) < 1e-9:  # BCa divides by the variance of the jackknife means
         return MeanInterval(mean)
     options = {"n_resamples": _RESAMPLES, "method": "BCa", "vectorized": True, "rng": np.random.default_rng(0)}
     found = bootstrap((values,), lambda x, axis: trim_mean(x, 0.25, axis=axis), **options)
     return MeanInterval(mean, *map(float, found.confidence_interval))
 
 
-def holm(p_values: Mapping[_Key, float]) -> dict[_Key, float]:
+def holm_corrected(p_values: Mapping[_Key, float]) -> dict[_Key, float]:
     """Return p-values corrected by Holm's method, which bounds the probability of any false rejection.
 
     A p-value of NaN stays NaN and is not counted as a hypothesis.

@@ -1,4 +1,4 @@
-"""Submissions: files of results for the page of results. Functions make, check, write and read them.
+"""Make, check, write and read submissions, which are files of results for the page docs/results.md.
 
 A submission has the return of every episode, so all numbers of the page can be computed from it. `Submission` defines
 the content; `icrl4aht-data submit --schema` prints the JSON schema.
@@ -130,7 +130,7 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
             settings = results[0].settings
             if any(result.settings != settings for result in results):
                 raise OptionError(f"{source}: the results have different settings; evaluate all tasks again")
-            if not control:  # the controls in a folder are of the same training run
+            if not control:  # controls in the same folder belong to the same training run
                 way = next((one for one in OTHER_WAYS if settings["agent"].endswith(f" ({one})")), "")
                 training = max(counts[way, result.task_id] for result in results)
                 counts.update((way, result.task_id) for result in results)
@@ -194,7 +194,7 @@ def _check_name(found: Submission, where: str) -> None:
     if not re.fullmatch(_NAME, found.agent) or found.agent.endswith(tuple(f" ({way})" for way in OTHER_WAYS)):
         raise OptionError(
             f"{where}: agent {found.agent!r}: expected one line without | and `, without spaces at its ends, and "
-            f"without a play mode at the end (the settings have it); give another --name"
+            f"without a play mode at the end, which the settings state; give another --name"
         )
 
 

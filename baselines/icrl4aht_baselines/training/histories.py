@@ -41,7 +41,7 @@ _CELL_FIELDS = {
     "algorithm": "teammate_kind",
     "source": "source",
 }
-"""Name in an entry of `training_cells` -> field of the release's index."""
+"""Name in an entry of `training_record` -> field of the release's index."""
 
 
 def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> TrainingTask:
@@ -99,13 +99,13 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             "sizes": {part: len(sampler.dataset) for part, sampler in samplers.items()},
             "teammates_split": None if split.teammates is None else " and ".join(split.teammates.counts("split")),
         },
-        TRAINED_ON: training_cells(split.train, labels),
+        TRAINED_ON: training_record(split.train, labels),
     }
     return TrainingTask(method, TrainingData(samplers.pop("train"), samplers), options, about)
 
 
 def history_settings(dataset: Dataset) -> dict[str, Any]:
-    """Return the settings of a run that describe the release: root, hash of the manifest, data version, layouts."""
+    """Return settings that describe a run's release: root, hash of the manifest, data version, layouts."""
     return {
         "root": str(dataset.origin if isinstance(dataset.origin, Remote) else dataset.root.resolve()),
         "manifest_sha256": file_hash(dataset.root / MANIFEST),
@@ -115,7 +115,7 @@ def history_settings(dataset: Dataset) -> dict[str, Any]:
 
 
 def _batch_view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | None:
-    """Return the function that makes the encoder's input from a batch; None for state records without changes."""
+    """Return the function that turns a batch into the encoder's input; None for unchanged state records."""
     changed = [f"mirror = {mirror}"] * mirror + [f"hide_recipe = {', '.join(hidden)}"] * bool(hidden)
     if changed and (dataset.obs != "state" or dataset.channels != "canonical"):
         raise OptionError(
@@ -168,10 +168,10 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, Any]) -> Dataset:
     return dataset.filter(**filters)
 
 
-def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[str, Any]]:
-    """Return a record of training data: an entry for each layout, split, teammate family, algorithm and source.
+def training_record(dataset: Dataset, labels: Labels | None = None) -> list[dict[str, Any]]:
+    """Return a record of training data, grouped by layout, split, teammate family, algorithm and source.
 
-    An entry has these five values, `labels`, the numbers of `tasks` and `histories`, `tasks_hash` (hash of the task
+    Each entry has these five values, `labels`, the numbers of `tasks` and `histories`, `tasks_hash` (hash of the task
     ids), and `teammates` (their ids, see `dataset.teammate_ids`; None if the release does not describe teammates).
 
     Args:
@@ -185,14 +185,14 @@ def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[
     for cell, own in table.groupby([*_CELL_FIELDS]):
         history_of = dict(zip(own["task"], own["history"].tolist(), strict=True))
         teammates = teammate_ids(dataset, [*history_of.values()])
-        cells.append(training_cell(map(str, cell), labels, history_of, len(own), teammates))
+        cells.append(training_record_entry(map(str, cell), labels, history_of, len(own), teammates))
     return cells
 
 
-def training_cell(
+def training_record_entry(
     cell: Iterable[str], labels: Labels | None, tasks: Collection[str], histories: int, teammates: list[str] | None
 ) -> dict[str, Any]:
-    """Return an entry for the record of training data, see `training_cells`.
+    """Return an entry for the record of training data, see `training_record`.
 
     Args:
         cell: layout, split, teammate family, algorithm and source.
@@ -301,7 +301,7 @@ class TrainedModel(NamedTuple):
         label: name in reports.
         encoder: kind of the encoder.
         hash: hash of the run's settings.
-        trained_on: record of the training data, see `training_cells`.
+        trained_on: record of the training data, see `training_record`.
         hide_recipe: names of layouts whose recipe indicators are hidden from the model.
     """
 
@@ -319,8 +319,8 @@ class TrainedModel(NamedTuple):
     hide_recipe: tuple[str, ...] = ()
 
 
-def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
-    """Return the parameters of an old run to start a new run with, and add the old run to the new run's settings.
+def load_initial_params(run: Path, method: Method, about: dict[str, Any]) -> Any:
+    """Return an old run's parameters as the start of a new run, and add the old run to the new run's settings.
 
     Args:
         run: run folder of the old run.
@@ -375,7 +375,7 @@ def read_trained(folder: Path) -> TrainedModel:
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
-    label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # encoders `words` and `paper` have equal features
+    label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # `words` computes the same features as `paper`
     names, digest = tuple(layout.name for layout in layouts), json_hash(config)
     hidden = tuple(histories.get("hide_recipe", ()))
     return TrainedModel(

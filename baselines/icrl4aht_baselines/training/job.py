@@ -67,7 +67,7 @@ class TrainingJob(ABC):
 
     @property
     def steps_per_update(self) -> int:
-        """Number of environment or history steps of a training step."""
+        """Number of environment or history steps in one training step."""
         return self.options.steps_per_update
 
     @property
@@ -84,7 +84,7 @@ class TrainingJob(ABC):
         return parse_json(read_text(self.result_file))
 
     def progress(self) -> tuple[int, float] | None:
-        """Return the finished training steps, and environment or history steps/s; None if no line is logged."""
+        """Return the number of finished training steps, and environment or history steps/s; None without a log."""
         for run, before in self.runs():
             if timing := last_line(run / TIMING):
                 return before + timing["step"], timing["steps_per_second"] * self.steps_per_update
@@ -95,7 +95,7 @@ class TrainingJob(ABC):
         return [(self.run_folder, 0)]
 
     def step_progress(self, on_update: OnUpdate, before: int = 0) -> StepProgress:
-        """Return a function that the trainer calls to report progress, and that calls `on_update`.
+        """Return a progress function for the trainer, which passes the progress on to `on_update`.
 
         Args:
             on_update: see `Job.run`.

@@ -28,7 +28,7 @@ LogLine = Callable[[Mapping[str, Any]], None]
 
 @contextmanager
 def _tensorboard(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
-    """Log to TensorBoard event files; each part of the data has its folder, so charts show all parts together."""
+    """Log to TensorBoard event files, in one folder for each part of the data; charts then show all parts together."""
     from tensorboardX import SummaryWriter
 
     writers: dict[str, Any] = {}
@@ -55,7 +55,7 @@ def _wandb(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
     mode, project = os.environ.get("WANDB_MODE", "offline"), os.environ.get("WANDB_PROJECT", PACKAGE)
     # By default, wandb would also record terminal output, machine load, and the state of a git repository.
     settings = wandb.Settings(console="off", silent=True, disable_git=True, x_disable_stats=True)
-    run = folder.parent  # wandb creates the subfolder `folder` itself
+    run = folder.parent  # wandb itself creates `folder` in this folder
     try:
         with _temporary_entry(os.environ, "WANDB_MODE", mode):
             started = wandb.init(project, name=run.name, dir=run, config=dict(config), settings=settings)
@@ -63,7 +63,7 @@ def _wandb(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
         reason = str(error).rstrip(".")
         raise OptionError(f"wandb with WANDB_MODE={mode}: {reason}; WANDB_MODE=offline needs no account") from error
     try:
-        yield lambda line: started.log(_prefixed(line), step=line["step"])
+        yield lambda line: started.log(_numbers_with_part(line), step=line["step"])
     finally:
         started.finish()
 
@@ -75,7 +75,7 @@ def _trackio(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
 
     wanted = os.environ.get("TRACKIO_DIR") or str(folder.absolute())
     with _temporary_entry(os.environ, "TRACKIO_DIR", wanted):
-        import trackio  # reads TRACKIO_DIR only at the first import
+        import trackio  # trackio reads TRACKIO_DIR only at its first import
         from trackio.utils import TRACKIO_DIR as used
     if used != Path(wanted):
         raise OptionError(
@@ -84,11 +84,12 @@ def _trackio(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
         )
     offline = constants.HF_HUB_OFFLINE or not {"TRACKIO_SPACE_ID", "TRACKIO_SERVER_URL"} & os.environ.keys()
     options: Any = {"config": dict(config), "embed": False, "auto_log_gpu": False, "auto_log_cpu": False}
-    # Otherwise Trackio would request the user's name from Hugging Face, and print a command that does not work here.
+    # Without these contexts, Trackio would request the user's name from Hugging Face, and print a command that does not
+    # work here.
     with _temporary_entry(constants.__dict__, "HF_HUB_OFFLINE", offline), redirect_stdout(io.StringIO()):
         started = trackio.init(PACKAGE, folder.parent.name, **options)
     try:
-        yield lambda line: started.log(_prefixed(line), step=line["step"])
+        yield lambda line: started.log(_numbers_with_part(line), step=line["step"])
     finally:
         with redirect_stdout(io.StringIO()):
             trackio.finish()
@@ -148,7 +149,7 @@ def _numbers(line: Mapping[str, Any]) -> dict[str, float]:
     return {name: value for name, value in line.items() if name not in ("step", "part")}
 
 
-def _prefixed(line: Mapping[str, Any]) -> dict[str, float]:
+def _numbers_with_part(line: Mapping[str, Any]) -> dict[str, float]:
     return {f"{line['part']}/{name}": value for name, value in _numbers(line).items()}
 
 

@@ -47,7 +47,7 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """Settings of a method that learns by playing: a step plays `batch_size` tasks, with `episodes` episodes of each.
+    """Settings of a method that learns by playing `episodes` episodes of `batch_size` tasks in each training step.
 
     Raises:
         OptionError: if a value is out of bounds.
@@ -104,7 +104,7 @@ class ResponseOptions:
 
     @property
     def steps_per_update(self) -> int:
-        """Number of environment steps of a training step, which plays one episode of every task."""
+        """Number of environment steps in one training step, which plays one episode of each of `tasks` tasks."""
         return self.tasks * KEPT_STEPS
 
     @property
@@ -201,5 +201,5 @@ class HistoryOptions:
 
     @property
     def filters(self) -> dict[str, Any]:
-        """Name of a field in `FILTERS` -> tuple of accepted values, for the fields that are set."""
+        """Accepted values of each filter that is set, by the field's name in `FILTERS`."""
         return {name: getattr(self, name) for name in FILTERS if getattr(self, name)}

@@ -70,7 +70,7 @@ def check_same_settings(found: dict[str, Any], expected: dict[str, Any], what: s
 
 
 def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
-    """Start a run in a folder, or check that the run in it has the same settings. Return the settings in the folder.
+    """Start a run in a folder, or check that the folder's run has the same settings. Return the settings in the folder.
 
     If the folder has settings but no checkpoint, there is nothing to resume, and the settings are replaced.
 
@@ -89,7 +89,7 @@ def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     if jax.process_index() == 0:
         names = config.get("histories", {}).get("layouts", ())
-        write_layouts_file(folder / LAYOUTS_NAME, map(get_layout, names))  # to evaluate the run without its release
+        write_layouts_file(folder / LAYOUTS_NAME, map(get_layout, names))  # evaluation then needs no release
         with atomic_write(folder / CONFIG) as partial:
             write_json(partial, config)
     return config

@@ -21,7 +21,7 @@ TASKS_SOURCE = "tasks"
 
 
 class SeenInTraining(NamedTuple):
-    """Layouts and teammates of the histories that a model was trained on.
+    """Layouts and teammates that a model was trained with, in histories or by playing.
 
     Attributes:
         layouts: names of the layouts.
@@ -34,7 +34,7 @@ class SeenInTraining(NamedTuple):
 
 
 class _Entry(Struct):
-    """Entry of a record of training data, see `histories.training_cells`."""
+    """Entry of a record of training data, see `histories.training_record`."""
 
     layout: str
     family: str

@@ -1,4 +1,4 @@
-"""Stop a training run by a signal without loss of progress."""
+"""Stop training on SIGTERM or SIGINT without loss of progress."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class TrainingStopped(SystemExit):
-    """Exit of a process after a signal stopped its training and the state was saved; the code is 128 + signal number.
+    """Exception that ends a process after a signal stopped its training; the exit code is 128 + signal number.
+
+    The state of the training is saved before this exception is raised.
 
     Args:
         number: number of the signal.

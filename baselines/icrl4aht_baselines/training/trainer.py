@@ -70,7 +70,7 @@ class TrainState(NamedTuple):
         params: pytree of float32 arrays.
         slow: exponential moving average of the parameters, or None.
         optimizer: state of the optimizer.
-        step: int32 (), number of steps so far.
+        step: int32 scalar, number of steps so far.
     """
 
     params: Any
@@ -166,7 +166,10 @@ class Trainer:
             return gradient, log
 
         def split_rows(rows: Array) -> Array:
-            """Split rows (B, ..) into interleaved micro-batches (parts, B / parts, ..) with rows on every device."""
+            """Split rows of shape (B, ..) into micro-batches of shape (parts, B / parts, ..).
+
+            The micro-batches are interleaved, so each has rows on every device.
+            """
             rows = rows.reshape(-1, parts, *rows.shape[1:]).swapaxes(0, 1)
             return jax.lax.with_sharding_constraint(rows, self._parts)
 
@@ -202,7 +205,7 @@ class Trainer:
 
 
 class TrainingTask(NamedTuple):
-    """Training that is ready to start in any folder.
+    """A training run that is set up; `train` runs it in a folder.
 
     Attributes:
         method: method to train.
@@ -271,7 +274,8 @@ class TrainingTask(NamedTuple):
             log = stack.enter_context(closing(RunLog(folder, lambda line: line["step"] <= first)))
             loggers = stack.enter_context(open_loggers(log_to if writes else (), folder / METRICS, config))
             batches = stack.enter_context(trainer.batches(self.data.train, first, options.steps))
-            stop = stack.enter_context(stop_signals())  # installed last, so that a signal during setup ends the process
+            # Handlers are installed after the setup, so a signal during the setup ends the process.
+            stop = stack.enter_context(stop_signals())
             before = first, time.perf_counter(), 0.0
             save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * SAVE_MINUTES)
             loss: float | None = None
@@ -300,7 +304,7 @@ class TrainingTask(NamedTuple):
                 if stopped_by:
                     name = signal.Signals(stopped_by).name
                     where = f"{folder}: stopped by {name} after step {step} of {options.steps}"
-                    raise TrainingStopped(stopped_by, f"{where}; its state is saved, and the same command resumes it")
+                    raise TrainingStopped(stopped_by, f"{where}; repeat the command to resume from the saved state")
             if writes and can_draw():
                 plot_training_log(folder / METRICS, folder / RUN_CURVES, self.method.name)
         return state

@@ -18,7 +18,7 @@ RENDER_MODES = ["rgb_array"]
 """Render modes of the environments: only RGB arrays, which Pillow draws."""
 
 
-def check_choices(channels: str, render_mode: str | None = None) -> None:
+def check_channels_and_render_mode(channels: str, render_mode: str | None = None) -> None:
     """Validate the names of an environment's observation channels and render mode.
 
     Raises:
@@ -46,7 +46,7 @@ def check_action(name: str, action: SupportsIndex) -> int:
 
 
 def check_record(layout: Layout, state: Any) -> np.ndarray:
-    """Validate a state record of a layout and return it as uint8 (S,).
+    """Validate a state record of a layout and return it as a uint8 array of shape (S,).
 
     Raises:
         OptionError: if the shape is wrong, or a value is impossible on this layout.

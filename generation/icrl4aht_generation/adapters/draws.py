@@ -16,7 +16,7 @@ from icrl4aht_generation.collection.scripted_rollout import scripted_episode_key
 from icrl4aht_generation.collection.task import learner_key
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.ego import stream_keys
-from icrl4aht_generation.profiles import Work
+from icrl4aht_generation.profiles import WorkUnit
 
 
 def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[
     if entry.source in SCRIPTED_SOURCES:  # every scripted episode is episode 0 of a new environment
         key, number = scripted_episode_keys(task.seed, np.array([entry.env_idx]), np.array([episode]))[0], 0
     elif entry.source == "ppo" and ego is not None:
-        key = stream_keys(learner_key(Work(task, learner=entry.learner)), ego["environments"])[entry.env_idx]
+        key = stream_keys(learner_key(WorkUnit(task, learner=entry.learner)), ego["environments"])[entry.env_idx]
     else:
         raise NotStoredError(
             f"{dataset.root}: history {history_id}, source {entry.source}: the release does not record the history's "

@@ -26,7 +26,7 @@ from icrl4aht_data.utils.options import check_int
 from icrl4aht_generation.adapters.arguments import (
     RENDER_MODES,
     check_action,
-    check_choices,
+    check_channels_and_render_mode,
     check_integers,
     check_record,
 )
@@ -81,7 +81,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         channels: Channels = "own",
         render_mode: str | None = None,
     ) -> None:
-        check_choices(channels, render_mode)
+        check_channels_and_render_mode(channels, render_mode)
         check_choice("noise", noise, get_args(Noise))
         if not isinstance(task, Mapping):
             raise TaskFormatError(
@@ -163,12 +163,12 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         return np.asarray(observation)[0], float(reward[0]), False, False, info
 
     def render(self) -> np.ndarray | None:
-        """Return a picture of the state, uint8 (height, width, 3), or None without a render mode."""
+        """Return a picture of the state, uint8 of shape (height, width, 3), or None without a render mode."""
         return None if self.render_mode is None else draw_frame(self.layout, self.state)
 
     @property
     def state(self) -> np.ndarray:
-        """State record of the running episode, uint8 (S,); see `icrl4aht_data.overcooked.state`."""
+        """State record of the running episode, uint8 of shape (S,); see `icrl4aht_data.overcooked.state`."""
         return np.array(self._running.env.record[0])
 
     @property
@@ -205,8 +205,8 @@ def _compiled_functions(
 ) -> tuple[Callable[..., tuple[_RunningEpisode, Array]], Callable[..., tuple[Any, ...]]]:
     """Return two compiled functions for a layout and a teammate family: one starts an episode, one plays a step.
 
-    A step returns the running episode, the observation uint8 (1, 5, 5, C), the reward float32 (1,), the shaped rewards
-    float32 (1, 2) and the teammate's action.
+    A step returns the running episode, the observation (uint8 of shape (1, 5, 5, C)), the reward (float32 of shape
+    (1,)), the shaped rewards (float32 of shape (1, 2)) and the teammate's action.
     """
     env = Environment(layout)
     teammate = lambda params: policy_player(env, policy, params, TEAMMATE, 1)  # noqa: E731

@@ -20,7 +20,7 @@ from icrl4aht_data.overcooked.state import unpack
 from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.text import counted_noun
-from icrl4aht_generation.adapters.arguments import check_choices
+from icrl4aht_generation.adapters.arguments import check_channels_and_render_mode
 from icrl4aht_generation.env import Environment, EnvState
 
 try:
@@ -75,7 +75,7 @@ class JaxMARLEnv(MultiAgentEnv):
     """
 
     def __init__(self, layout: str, *, max_steps: int = EPISODE_STEPS, channels: Channels = "own") -> None:
-        check_choices(channels)
+        check_channels_and_render_mode(channels)
         super().__init__(num_agents=2)
         self.layout = get_layout(layout)
         self.max_steps = check_int("max_steps", max_steps, 1)

@@ -21,7 +21,12 @@ from icrl4aht_data.overcooked.render import draw_frame
 from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.text import counted_noun
-from icrl4aht_generation.adapters.arguments import RENDER_MODES, check_action, check_choices, check_record
+from icrl4aht_generation.adapters.arguments import (
+    RENDER_MODES,
+    check_action,
+    check_channels_and_render_mode,
+    check_record,
+)
 from icrl4aht_generation.env import Environment, EnvState
 
 try:
@@ -67,7 +72,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         channels: Channels = "own",
         render_mode: str | None = None,
     ) -> None:
-        check_choices(channels, render_mode)
+        check_channels_and_render_mode(channels, render_mode)
         self.layout = get_layout(layout)
         self.max_steps = check_int("max_steps", max_steps, 1)
         self.render_mode = render_mode
@@ -147,11 +152,11 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         )
 
     def render(self) -> np.ndarray | None:
-        """Return a picture of the state, uint8 (height, width, 3), or None without a render mode."""
+        """Return a picture of the state, uint8 of shape (height, width, 3), or None without a render mode."""
         return None if self.render_mode is None else draw_frame(self.layout, self.state())
 
     def state(self) -> np.ndarray:
-        """Return the state record uint8 (S,); see `icrl4aht_data.overcooked.state`.
+        """Return the state record, uint8 of shape (S,); see `icrl4aht_data.overcooked.state`.
 
         Raises:
             OptionError: if `reset` was not called before.

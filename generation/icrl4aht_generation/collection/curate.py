@@ -25,10 +25,13 @@ from icrl4aht_generation.policy import Policy
 
 
 def stream_returns(rewards: np.ndarray) -> np.ndarray:
-    """Return the episode returns in N environments, float64 (N, E), summed over the stored steps of each episode.
+    """Return the episode returns in N environments, summed over the stored steps of each episode.
 
     Args:
-        rewards: rewards in N environments, int8 (N, T).
+        rewards: rewards in N environments, int8 of shape (N, T).
+
+    Returns:
+        float64 array of shape (N, E).
     """
     return rewards.reshape(len(rewards), -1, KEPT_STEPS).sum(axis=-1, dtype=np.float64)
 
@@ -42,7 +45,7 @@ def select_streams(
     stream, and the learner with the best stream of the round comes first.
 
     Args:
-        returns: for each learner (N, E), episode returns of its streams.
+        returns: episode returns of each learner's streams, arrays of shape (N, E).
         keep: maximum number of streams of all learners together.
         least_improvement: minimum improvement from a stream's initial to its final return; None for no minimum.
 
@@ -65,8 +68,8 @@ def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: floa
     """Return the mean initial and final return of all streams (histories of environments), and of selected streams.
 
     Args:
-        before: (N, E), episode returns of all streams.
-        after: (n, E), episode returns of the selected streams.
+        before: episode returns of all streams, of shape (N, E).
+        after: episode returns of the selected streams, of shape (n, E).
         least_improvement: minimum improvement of the selected streams.
     """
     sides = []
@@ -76,8 +79,8 @@ def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: floa
     return StreamFilter(before=sides[0], after=sides[1], least_improvement=least_improvement)
 
 
-def relabel(layout: Layout, network: ActorCritic, params: Any, states: np.ndarray) -> np.ndarray:
-    """Return a policy's most probable action at every step of a history, int8 (T,).
+def greedy_labels(layout: Layout, network: ActorCritic, params: Any, states: np.ndarray) -> np.ndarray:
+    """Return a policy's most probable action at every step of a history, int8 of shape (T,).
 
     The recurrent state is zero at the start of each episode, as in training.
 
@@ -87,11 +90,11 @@ def relabel(layout: Layout, network: ActorCritic, params: Any, states: np.ndarra
         params: parameters of the checkpoint that chooses the actions.
         states: state records of the history, uint8 (T, S).
     """
-    return _by_step(_compiled_greedy(layout, network.widths)(params, _by_episode(states)))
+    return _by_step(_compiled_greedy_labels(layout, network.widths)(params, _by_episode(states)))
 
 
 def oracle_labels(layout: Layout, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Return the scripted oracle's action at every step of a history, int8 (T,).
+    """Return the scripted oracle's action at every step of a history, int8 of shape (T,).
 
     The oracle follows every episode from its first step: it remembers the recorded states and the actions that the ego
     took, and chooses its own action at each state.
@@ -101,22 +104,25 @@ def oracle_labels(layout: Layout, states: np.ndarray, actions: np.ndarray) -> np
         states: state records of the history, uint8 (T, S).
         actions: the ego's actions, int8 (T,).
     """
-    return _by_step(_compiled_oracle(layout)(_by_episode(states), _by_episode(actions)))
+    return _by_step(_compiled_oracle_labels(layout)(_by_episode(states), _by_episode(actions)))
 
 
 def _by_episode(history: np.ndarray) -> jax.Array:
-    """Reshape an array (T, ...) of a history to (100, E, ...), with the step of the episode as first axis."""
+    """Reshape a history's array of shape (T, ...) to (100, E, ...), with the step within the episode as first axis."""
     return jnp.asarray(history.reshape(-1, KEPT_STEPS, *history.shape[1:]).swapaxes(0, 1))
 
 
 def _by_step(labels: jax.Array) -> np.ndarray:
-    """Reshape (100, E) to (T,), the inverse of `_by_episode`."""
+    """Reshape an array of shape (100, E) to (T,), the inverse of `_by_episode`."""
     return np.asarray(labels).swapaxes(0, 1).reshape(-1)
 
 
 @lru_cache(maxsize=8)
-def _compiled_greedy(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array], jax.Array]:
-    """Return a compiled function of parameters and state records (100, E, S) that returns greedy actions (100, E)."""
+def _compiled_greedy_labels(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array], jax.Array]:
+    """Return a compiled function that computes a network's greedy actions in E episodes of 100 steps.
+
+    Its arguments are parameters and state records of shape (100, E, S); the actions have the shape (100, E).
+    """
     network = ActorCritic(widths)
 
     @jax.jit
@@ -130,8 +136,11 @@ def _compiled_greedy(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array
 
 
 @lru_cache(maxsize=8)
-def _compiled_oracle(layout: Layout) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Return a compiled function of state records (100, E, S) and ego actions (100, E) that returns oracle actions."""
+def _compiled_oracle_labels(layout: Layout) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """Return a compiled function that computes the oracle's actions in E episodes of 100 steps.
+
+    Its arguments are state records of shape (100, E, S) and the actions that the ego took, of shape (100, E).
+    """
     return jax.jit(lambda records, taken: follow_script(oracle(layout), layout, records, taken)[0].astype(jnp.int8))
 
 
@@ -143,7 +152,7 @@ def follow_script(
     numbers: jax.Array | None = None,
     memory: Any = None,
 ) -> tuple[jax.Array, Any]:
-    """Return a script's actions in the states of episodes that another ego played, and the script's memory.
+    """Return the actions that a script chooses in the states of another ego's episodes, and the script's memory.
 
     Args:
         script: policy from `oracle` or `searcher`.

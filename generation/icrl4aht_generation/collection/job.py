@@ -12,7 +12,7 @@ from icrl4aht_generation.collection.task import TASK_SAVE_SECONDS, train_and_rec
 from icrl4aht_generation.collection.task_folder import is_task_finished, last_timing, partial_folder, publish_artefact
 from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.resume import run_lock
-from icrl4aht_generation.profiles import Profile, Work
+from icrl4aht_generation.profiles import Profile, WorkUnit
 
 _GENERATORS = {"ppo": train_and_record, "noise": play_histories, "search": play_histories}
 """Function of each source that generates an artefact in its partial folder, or resumes there."""
@@ -20,7 +20,7 @@ _GENERATORS = {"ppo": train_and_record, "noise": play_histories, "search": play_
 
 @dataclass(frozen=True)
 class CollectionJob:
-    """Job that generates the artefact of one unit of work, see `Work`.
+    """Job that generates the artefact of one unit of work, see `WorkUnit`.
 
     Attributes:
         work: unit of work: a task with a source and a learner.
@@ -30,7 +30,7 @@ class CollectionJob:
         layouts: all generated layouts of the profile, since every worker compiles for the largest of these layouts.
     """
 
-    work: Work
+    work: WorkUnit
     profile: Profile
     artefacts: Path
     suite: Path | None = None
@@ -58,8 +58,8 @@ class CollectionJob:
         """Number of updates of the ego, or of batches of episodes that a script plays."""
         layout, source = self.work.task.layout.name, self.work.source
         if source == "ppo":
-            return self.profile.ego_on(layout).updates
-        return len(scripted_batches(source, self.profile.scripted_on(layout, source)))
+            return self.profile.ego_config(layout).updates
+        return len(scripted_batches(source, self.profile.scripted_config(layout, source)))
 
     @property
     def xla_threads(self) -> int | None:

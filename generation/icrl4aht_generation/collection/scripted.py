@@ -34,10 +34,10 @@ from icrl4aht_generation.collection.task_folder import (
     array_shapes,
     arrays_bytes,
     finish_artefact,
-    reserve_disk,
+    guard_disk_space,
 )
 from icrl4aht_generation.jobs.job import OnUpdate
-from icrl4aht_generation.profiles import Profile, Work
+from icrl4aht_generation.profiles import Profile, WorkUnit
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.teammates.registry import build_teammate
 
@@ -45,7 +45,7 @@ _LINE_BYTES = 100  # maximum size of a line in the files of metrics or timing
 
 
 def _array_shapes(layout: Layout, config: NoiseConfig) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Return array name -> shape and dtype, for the arrays in a task folder with histories that a script plays."""
+    """Return the shape and dtype, by name, of each array in a task folder with histories that a script plays."""
     actions, chances = SCRIPT_ARRAYS
     return array_shapes(layout, config.histories, config.episodes) | {
         actions: ((config.histories, config.episodes * KEPT_STEPS), "int8"),
@@ -59,17 +59,17 @@ def scripted_bytes(layout: Layout, config: NoiseConfig) -> int:
 
 
 def play_histories(
-    work: Work, profile: Profile, partial: Path, on_update: OnUpdate, suite: Path | None, save_seconds: float
+    work: WorkUnit, profile: Profile, partial: Path, on_update: OnUpdate, suite: Path | None, save_seconds: float
 ) -> None:
     """Play the histories of a task with a script, and write them to a partial artefact."""
-    task, config = work.task, profile.scripted_on(work.task.layout.name, work.source)
+    task, config = work.task, profile.scripted_config(work.task.layout.name, work.source)
     layout = None if task.teammate["kind"] == "heuristic" else task.layout
     teammate = build_teammate(layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
     schedules, batches = noise_schedules(config, task.seed), scripted_batches(work.source, config)
     needed = scripted_bytes(task.layout, config)
     shutil.rmtree(partial, ignore_errors=True)  # left by a killed run
     partial.mkdir(parents=True)
-    with reserve_disk(partial, needed):
+    with guard_disk_space(partial, needed):
         with closing(ArrayWriter(partial, _array_shapes(task.layout, config))) as writer:
             writer.arrays["noise"][:] = schedules
             played = play_scripted_histories(task.layout, teammate, task.seed, work.source, batches, schedules)

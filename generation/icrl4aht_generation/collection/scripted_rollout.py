@@ -30,7 +30,7 @@ from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
 from icrl4aht_generation.experts.padded import padded_layout, unpadded_layout
 from icrl4aht_generation.experts.search import SITUATION_SEARCHER, padded_dishes, with_taken_action
 from icrl4aht_generation.learners.rollout import Player, init_rollout, policy_player, roll_out, select_rows
-from icrl4aht_generation.policy import Policy, sometimes_random
+from icrl4aht_generation.policy import Policy, randomize_action
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
 EPISODES_AT_ONCE = 256
@@ -42,7 +42,7 @@ _NOISE = 2
 
 
 def noise_schedules(config: NoiseConfig, seed: int) -> np.ndarray:
-    """Return the chance of a random action in every episode, float32 (N, E); see `NoiseConfig`.
+    """Return the chance of a random action in every episode, float32 of shape (N, E); see `NoiseConfig`.
 
     Args:
         config: ranges from which the schedule of each history is drawn.
@@ -77,7 +77,7 @@ ScriptedBatch = tuple[np.ndarray, np.ndarray]
 
 def scripted_batches(source: str, config: NoiseConfig) -> list[ScriptedBatch]:
     """Return the batches of episodes of a task, in the order of play."""
-    if source == "search":  # a batch has one episode per history, as the script remembers earlier episodes
+    if source == "search":  # a batch has one episode per history, because the script remembers earlier episodes
         histories = np.arange(config.histories)
         return [(histories, np.full_like(histories, episode)) for episode in range(config.episodes)]
     count, each = config.histories * config.episodes, np.arange(EPISODES_AT_ONCE)
@@ -174,7 +174,7 @@ def _compiled_play(teammate: Policy, searches: bool) -> Callable[..., tuple[dict
             "actions": by_episode(choice.action),
             "teammate_actions": by_episode(rollout.actions[..., TEAMMATE]),
             "rewards": by_episode(rollout.reward),
-            "episode_end_state": carry.env.record,  # not a reset state, because the environment's episodes are longer
+            "episode_end_state": carry.env.record,  # no reset yet: the environment's episodes have 400 steps
             "script_actions": by_episode(choice.clean),
         }
         return episodes, carry.memories[EGO] if searches else None
@@ -200,7 +200,7 @@ def _noisy_script(env: Environment, script: Policy, params: Any, chance: Float[A
     def act(memory: Any, state: EnvState, key: Key[Array, ""]) -> Any:
         choice, memory = player.act(memory, state, key)
         own = fold(env.episode_key(state), jnp.full_like(state.clock, _NOISE))
-        action = jax.vmap(sometimes_random)(fold(own, state.clock), chance, choice.action)
+        action = jax.vmap(randomize_action)(fold(own, state.clock), chance, choice.action)
         return NoisyChoice(action, choice.action), with_taken_action(memory, action)
 
     return player._replace(act=act)

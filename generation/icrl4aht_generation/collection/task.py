@@ -21,15 +21,15 @@ from icrl4aht_generation.collection.task_folder import (
     ArtefactWriter,
     artefact_settings,
     finish_artefact,
+    guard_disk_space,
     needed_bytes,
-    reserve_disk,
 )
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.ego import Learner, compiled_update
 from icrl4aht_generation.learners.resume import OtherSettingsError, SaveInterval, StateFile, software_versions
 from icrl4aht_generation.policy import Noise
-from icrl4aht_generation.profiles import Profile, Work
+from icrl4aht_generation.profiles import Profile, WorkUnit
 from icrl4aht_generation.teammates.registry import build_teammate
 
 TEAMMATE_NOISE: Noise = "seeded"
@@ -42,11 +42,11 @@ TASK_SAVE_SECONDS = 30.0
 def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Learner:
     """Return the untrained ego of a task. `suite` is the folder of learned teammates."""
     teammate = build_teammate(task.layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
-    return Learner(Environment(task.layout), teammate, profile.ego_on(task.layout.name))
+    return Learner(Environment(task.layout), teammate, profile.ego_config(task.layout.name))
 
 
 def train_and_record(
-    work: Work, profile: Profile, partial: Path, on_update: OnUpdate, suite: Path | None, save_seconds: float
+    work: WorkUnit, profile: Profile, partial: Path, on_update: OnUpdate, suite: Path | None, save_seconds: float
 ) -> None:
     """Train the ego of a task, and record its histories in a partial artefact."""
     task, saved = work.task, StateFile(partial / LEARNER, artefact_settings(work, profile) | software_versions())
@@ -55,7 +55,7 @@ def train_and_record(
     state = saved.load(jax.eval_shape(init, key)) if first else init(key)
     needed, update = needed_bytes(task, learner.config, state), compiled_update(learner)
 
-    with reserve_disk(partial, needed):
+    with guard_disk_space(partial, needed):
         interval = SaveInterval(learner.config.updates, seconds=save_seconds)
         unwritten: Any = None  # the rollout to write while the device computes the next update
         with closing(ArtefactWriter(partial, task, learner.config, first)) as writer:
@@ -75,7 +75,10 @@ def train_and_record(
 
 
 def saved_progress(saved: StateFile) -> int:
-    """Return the number of updates saved with the same settings; if nothing is saved, empty the folder and return 0."""
+    """Return the number of finished updates in the saved state if its settings are the same.
+
+    Otherwise, empty the folder and return 0.
+    """
     with suppress(OtherSettingsError):  # another profile or version saved this state, so it cannot be resumed
         if done := saved.progress:
             return done
@@ -84,7 +87,7 @@ def saved_progress(saved: StateFile) -> int:
     return 0
 
 
-def learner_key(work: Work) -> Any:
+def learner_key(work: WorkUnit) -> Any:
     """Return the typed JAX key of a learner; learners of a task have independent keys, derived from the task's seed."""
     key = jax.random.key(work.task.seed)
     return jax.random.fold_in(key, work.learner) if work.learner else key

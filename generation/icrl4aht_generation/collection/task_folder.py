@@ -39,7 +39,7 @@ from icrl4aht_data.utils.files import (
     NO_ROOM,
     atomic_write,
     file_hash,
-    have_hashes,
+    hashes_match,
     json_hash,
     parse_json,
     read_text,
@@ -50,7 +50,7 @@ from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, last_line, xla_threads
 from icrl4aht_generation.learners.rollout import Rollout
-from icrl4aht_generation.profiles import Profile, Work
+from icrl4aht_generation.profiles import Profile, WorkUnit
 
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
 LABELLER_RETURNS = "labeller_returns.json"
@@ -128,7 +128,7 @@ def checkpoint_path(folder: Path, number: int) -> Path:
     return folder / "checkpoints" / f"c{number}"
 
 
-def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
+def artefact_settings(work: WorkUnit, profile: Profile) -> dict[str, Any]:
     """Return all settings that an artefact depends on, as JSON values; any change makes the artefact outdated."""
     settings: dict[str, Any] = {
         "task": asdict(work.task),
@@ -138,31 +138,31 @@ def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
     }
     layout = work.task.layout.name
     if work.source in SCRIPTED_SOURCES:
-        settings["noise"] = asdict(profile.scripted_on(layout, work.source))
+        settings["noise"] = asdict(profile.scripted_config(layout, work.source))
     else:
-        ego = profile.ego_on(layout)
+        ego = profile.ego_config(layout)
         settings |= {"ego_hash": json_hash(asdict(ego)), "checkpoint_updates": checkpoint_updates(ego)}
     return json.loads(json.dumps(settings))  # turns tuples into lists, as in the stored file
 
 
-def hashed_files(work: Work, profile: Profile) -> list[str]:
+def hashed_files(work: WorkUnit, profile: Profile) -> list[str]:
     """Return the names of the files that an artefact's metadata lists with their hashes, sorted."""
     files = {METRICS, *(f"{name}.npy" for name in HISTORY_ARRAYS)}
     if work.source in SCRIPTED_SOURCES:
         return sorted(files | {f"{name}.npy" for name in SCRIPT_ARRAYS})
-    count = len(checkpoint_updates(profile.ego_on(work.task.layout.name)))
+    count = len(checkpoint_updates(profile.ego_config(work.task.layout.name)))
     checkpoints = [checkpoint_path(Path(), number) for number in range(count)]
     return sorted(files | {(path / name).as_posix() for path in checkpoints for name in (POLICY_WEIGHTS, POLICY_CARD)})
 
 
-def is_task_finished(folder: Path, work: Work, profile: Profile) -> bool:
+def is_task_finished(folder: Path, work: WorkUnit, profile: Profile) -> bool:
     """Return whether a folder contains the complete artefact of a unit of work, with the profile's settings."""
     settings = artefact_settings(work, profile)
     try:
         metadata = parse_json(read_text(folder / METADATA))
         same = {name: metadata[name] for name in settings} == settings
         listed = sorted(metadata["files"]) == hashed_files(work, profile)
-        return same and listed and have_hashes(folder, metadata["files"])
+        return same and listed and hashes_match(folder, metadata["files"])
     except (IndexFormatError, OSError, KeyError, TypeError):
         return False
 
@@ -181,7 +181,7 @@ def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:
 
 
 @contextmanager
-def reserve_disk(partial: Path, needed: int) -> Iterator[None]:
+def guard_disk_space(partial: Path, needed: int) -> Iterator[None]:
     """Check that the disk has space for an artefact, and convert errors of a full disk to `DiskFullError`.
 
     If the disk is full, an artefact without a saved state to resume from is removed.
@@ -209,11 +209,11 @@ def reserve_disk(partial: Path, needed: int) -> Iterator[None]:
         ) from error
 
 
-def finish_artefact(partial: Path, work: Work, profile: Profile) -> None:
+def finish_artefact(partial: Path, work: WorkUnit, profile: Profile) -> None:
     """Write the metadata file of an artefact, which completes its partial folder."""
     settings = artefact_settings(work, profile) | {"profile": profile.name}
     if work.source == "ppo":
-        settings |= {"ego": asdict(profile.ego_on(work.task.layout.name))}
+        settings |= {"ego": asdict(profile.ego_config(work.task.layout.name))}
     metadata = settings | {
         "jax_version": jax.__version__,
         "platform": jax.default_backend(),

@@ -129,13 +129,13 @@ def _shortest_walks(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
     position = np.zeros(layout.cells, int)  # index of each cell within the ego's room
     position[room] = range(len(room))
     moves = layout.moves[room, :4].astype(int)
-    ends = np.where(moves == obstacles[:, None, None], room[:, None], moves)  # (O, room, actions)
+    ends = np.where(moves == obstacles[:, None, None], room[:, None], moves)  # shape (O, room, actions)
     steps = _walking_steps(position[ends])
     ways = np.full((len(obstacles), layout.cells, layout.cells), NOWHERE - 1, np.uint8)
     for action in range(4):
         end = ends[..., action]
         faced = layout.ahead[end, FACING_OF[action]].astype(int)
-        # Turns and moves are separate assignments, so no cell of `ways` occurs twice in one assignment.
+        # Assign turns and moves separately, because no entry of `ways` may occur twice in one assignment.
         for walks in (False, True):
             obstacle, start = np.nonzero((end != room) == walks)
             own = obstacle[:, None], room, faced[obstacle, start][:, None]
@@ -144,10 +144,13 @@ def _shortest_walks(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
 
 
 def _walking_steps(ends: np.ndarray) -> np.ndarray:
-    """Return the steps between all pairs of cells of a room, uint8 (O, room, room); NOWHERE - 2 if unreachable.
+    """Return the steps between all pairs of cells of a room, or NOWHERE - 2 for cells that cannot be reached.
 
     Args:
-        ends: index within the room of the cell that each move leads to, int (O, room, actions).
+        ends: index within the room of the cell that each move leads to, int of shape (O, room, actions).
+
+    Returns:
+        uint8 array of shape (O, room, room).
     """
     steps = np.where(np.eye(ends.shape[1], dtype=bool), 0, np.uint8(NOWHERE - 2))
     steps = np.tile(steps.astype(np.uint8), (len(ends), 1, 1))
@@ -161,7 +164,7 @@ def _walking_steps(ends: np.ndarray) -> np.ndarray:
 
 
 def _hindrance(layout: Layout, tables: Tables) -> np.ndarray:
-    """Return how much the ego would hinder the teammate by waiting on a cell, int16 (3, cells, cells).
+    """Return how much the ego would hinder the teammate by waiting on a cell, int16 of shape (3, cells, cells).
 
     The axes are what the teammate carries (0 a dish, 1 a plate or an ingredient, 2 nothing), the teammate's cell, and
     the ego's cell. The next cell of each route that the teammate may take counts 16, the neighbours of this cell 8, and

@@ -165,7 +165,7 @@ class OracleView:
         return self.recipes[0] | _DISH
 
     def cost(self, mask: Bool[Array, " cells"] | np.ndarray, then: Array | int = 0) -> Int[Array, " cells"]:
-        """Return the steps to each cell of a mask, plus `then` further steps. All other cells cost NEVER."""
+        """Return the steps until the ego faces each reachable cell in `mask`, plus `then`; NEVER for other cells."""
         return jnp.where(mask & self.facts.mine, self.time + then, NEVER)
 
     @cached_property
@@ -175,11 +175,11 @@ class OracleView:
 
     @cached_property
     def steps_to_pots(self) -> Int[Array, "cells P"]:
-        """Steps from facing each cell to facing each pot."""
+        """Steps that an ego which faces one cell needs until it faces a pot, for all cells and pots."""
         return _decode_steps(jnp.asarray(self.facts.leg))
 
     def cost_at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:
-        """Return the steps to each of the given pots, plus `then` further steps. All other cells cost NEVER."""
+        """Return the steps until the ego faces each reachable pot in `which`, plus `then`; NEVER for other cells."""
         there = jnp.where(which & self.facts.pots, self.pot_times + then, NEVER)
         return jnp.where(self.scene.cells_of_kind(POT), self.scene.values_on_cells(POT, there), NEVER)
 
@@ -219,7 +219,7 @@ class OracleView:
 
     @cached_property
     def spoiled_pots(self) -> Bool[Array, " P"]:
-        """Partly filled pots with ingredients that the ego cannot complete to a recipe that it should cook.
+        """Partly filled pots whose contents the ego cannot complete to any recipe that it should cook.
 
         No pot counts if the ego cannot serve, or while a soup of the current recipe is in stock.
         """
@@ -350,9 +350,9 @@ def _dish_subgoals(view: OracleView) -> list[Subgoal]:
         Subgoal(scene.hand == view.dish, view.cost(scene.goals)),
         # Keep a dish of another recipe on a counter, because a wrong delivery costs 20.
         Subgoal(scene.holds_dish, view.parking_cost),
-        # Take a ready dish, because its delivery earns most per step.
+        # Take a dish of the current recipe from a counter, because its delivery earns most per step.
         Subgoal(scene.holds_nothing, view.cost(wanted)),
-        # Free the hand for a ready dish.
+        # Put down another item to take a dish of the current recipe.
         Subgoal(jnp.any(wanted), view.parking_cost),
         # Wait where the teammate puts down a dish that only the ego can deliver.
         Subgoal(comes, near),

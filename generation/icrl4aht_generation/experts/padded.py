@@ -11,7 +11,7 @@ import numpy as np
 
 from icrl4aht_data.overcooked.cells import GOAL
 from icrl4aht_data.overcooked.layouts import Layout, known_layouts
-from icrl4aht_data.overcooked.state import padded_positions
+from icrl4aht_data.overcooked.state import padded_columns
 from icrl4aht_data.overcooked.tables import Tables, stack_tables
 from icrl4aht_generation.experts.oracle import oracle_params
 
@@ -61,12 +61,12 @@ def _pad_to_largest(layout: Layout, others: tuple[Layout, ...]) -> PaddedLayout:
     tables = jax.tree.map(lambda leaf: leaf[0], stack_tables(group))
     facts, blank = oracle_params(group)
     oracle = jax.tree.map(lambda leaf: leaf[:1], facts), blank
-    return PaddedLayout(tables, oracle, padded_positions(layout, tables))
+    return PaddedLayout(tables, oracle, padded_columns(layout, tables))
 
 
 @lru_cache(maxsize=8)
 def largest_layouts(layouts: tuple[Layout, ...]) -> list[Layout]:
-    """Return layouts that include a largest layout along every axis of the tables and of `LayoutFacts`."""
+    """Return a subset of the layouts: for each axis of the tables and of `LayoutFacts`, one with the largest size."""
     if not layouts:
         return []
     sizes = np.array([_axis_sizes(layout) for layout in layouts])

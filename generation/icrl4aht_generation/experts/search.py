@@ -71,7 +71,7 @@ def searcher(layouts: Layout | Sequence[Layout], advises: bool = False) -> Polic
 
 
 def padded_dishes(layouts: Sequence[Layout]) -> np.ndarray:
-    """Return the item bytes of the dishes that can be made on each layout, uint8 (layouts, D), padded with 0."""
+    """Return the item bytes of the dishes that can be made on each layout, of shape (layouts, D), padded with 0."""
     dishes = np.full((len(layouts), MOST_DISHES), _NO_DISH, np.uint8)
     for own, layout in zip(dishes, layouts, strict=True):
         possible = possible_recipes(layout)
@@ -116,14 +116,14 @@ _ADVISING_SEARCHER = Policy((), _initial_memory, partial(_act, advises=True), "s
 def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"], advises: bool) -> SearchMemory:
     """Return the memory updated by the outcome of the previous step."""
     new, old = unpack(view.tables, view.record), unpack(view.tables, memory.oracle.record)
-    # At an episode's first step, `follows` is almost always False: few starts are one move from the last positions.
+    # `follows` is almost always False at an episode's first step: few starts are one move from the last positions.
     moves = jnp.asarray(view.tables.moves)[old.positions.astype(jnp.int32)]
     follows = jnp.all(jnp.any(moves == new.positions[:, None], axis=1))
     ahead = jnp.asarray(view.tables.ahead)[old.positions.astype(jnp.int32), old.facings.astype(jnp.int32)]
     at_goal = jnp.asarray(view.tables.kinds)[ahead.astype(jnp.int32)] == GOAL
     same_pose = (new.positions == old.positions) & (new.facings == old.facings)
     gave = (old.hands & COOKED > 0) & (new.hands == 0) & at_goal & same_pose & follows
-    is_dish = (old.hands[:, None] == dishes | _FLAGS) & gave[:, None]  # bool (2, D)
+    is_dish = (old.hands[:, None] == dishes | _FLAGS) & gave[:, None]  # shape (2, D)
     # If both agents deliver in one step, the reward does not show whose dish was right.
     paid = memory.paid | (is_dish.any(axis=0) & (new.delivered > 0) & ~gave.all())
     refused = memory.refused | (is_dish[EGO] & (new.delivered == 0))
@@ -137,14 +137,14 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
     idle = jnp.all(new.pot_items == 0) & (new.hands[EGO] == 0)
     change = idle | refused[memory.belief] | paid.any()
     if advises:
-        fitting = jnp.all(Scene.ingredient_counts(dishes) >= _begun_dish(new), axis=-1)
+        fitting = jnp.all(Scene.ingredient_counts(dishes) >= _begun_ingredients(new), axis=-1)
         score = score - 50.0 * ~fitting  # weighs more than the teammate's ingredients, less than a reward or refusal
         change |= ~fitting[memory.belief]
     belief = jnp.where(change, score.argmax(), memory.belief)
     return memory._replace(paid=paid, refused=refused, seen=seen, belief=belief)
 
 
-def _begun_dish(state: State) -> Int[Array, " 3"]:
+def _begun_ingredients(state: State) -> Int[Array, " 3"]:
     """Return the number of pieces of each ingredient in the soup that the ego carries.
 
     If the ego carries no soup, count the ingredients in the fullest pot, and in the ego's hand if the pot has room.

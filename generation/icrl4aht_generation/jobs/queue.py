@@ -32,7 +32,7 @@ from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.ray_executor import run_on_ray
 
 _POLL_SECONDS = 1.0
-_QUICK_JOBS = 256  # a process is replaced after this number of jobs to release its memory
+_QUICK_JOBS = 256  # number of jobs after which a process is replaced, to release its memory
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOptions) -> None:
@@ -175,7 +175,7 @@ def _start_job(job: Job, wait: bool, idle: list[ProcessPoolExecutor]) -> tuple[F
     if idle:
         pool = idle.pop()
         if job.is_quick:
-            with suppress(BrokenExecutor):  # the idle process was killed
+            with suppress(BrokenExecutor):  # in case the idle process was killed
                 return pool.submit(run_in_worker, job, wait), pool
         pool.shutdown()  # an idle process holds memory that the new process may need
     # A pool has a single process, since a killed worker breaks its whole pool.

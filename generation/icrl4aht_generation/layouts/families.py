@@ -86,7 +86,7 @@ def find_generated(name: str) -> Layout:
 
 
 def _named_layouts(family: str, seed: int) -> Iterator[Layout]:
-    """Yield distinct layouts of a family with names, until `MOST_REPEATS` draws in a row repeat earlier layouts."""
+    """Yield distinct named layouts of a family, until `MOST_REPEATS` draws in a row repeat earlier layouts."""
     known = {canonical_map(get_layout(name)) for name in LAYOUT_NAMES}
     number = repeats = 0
     for drawn in LAYOUT_FAMILIES[family](seed):
@@ -110,5 +110,5 @@ def split_of(layout: Layout) -> str:
     splits = [split for split in LAYOUT_SPLITS if split != "train" or not has_tested_rooms(layout)]
     digest = hashlib.sha256("\n".join(canonical_map(layout)).encode()).digest()
     ends = np.cumsum([LAYOUT_SPLITS[split] for split in splits])
-    position = int.from_bytes(digest[:6], "big") / 2**48  # never rounded up to 1, as a float stores six bytes exactly
+    position = int.from_bytes(digest[:6], "big") / 2**48  # below 1, because a float stores six bytes exactly
     return splits[int(np.searchsorted(ends, position * ends[-1], side="right"))]

@@ -79,7 +79,7 @@ def _ingredient_letters(recipes: Sequence[tuple[int, int, int]]) -> set[str]:
 
 
 def faced_cells(rooms: np.ndarray) -> np.ndarray:
-    """Return the cells that each agent can face, bool (2, H, W), from the floors of their rooms, bool (2, H, W)."""
+    """Return the cells that each agent can face, given the floors of their rooms; both are bool of shape (2, H, W)."""
     return np.stack([neighbours(room) & ~room for room in rooms])
 
 

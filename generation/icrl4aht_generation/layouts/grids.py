@@ -1,6 +1,7 @@
 """Maps as arrays: rooms, mirror images, rotations, and a canonical form of maps that differ only by symmetry.
 
-Shapes: `H` rows, `W` columns. A grid is an array (H, W) of map letters, see `icrl4aht_data.overcooked.layouts`.
+Shapes: `H` rows, `W` columns. A grid is an array of shape (H, W) with the letters of a map, see
+`icrl4aht_data.overcooked.layouts`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 
 
 def grid_of(layout: Layout) -> np.ndarray:
-    """Return the map of a layout, str (H, W)."""
+    """Return the map of a layout as an array of letters, of shape (H, W)."""
     return np.array([list(row) for row in layout.rows])
 
 
@@ -23,7 +24,7 @@ def rows_of(grid: np.ndarray) -> tuple[str, ...]:
 
 
 def neighbours(mask: np.ndarray) -> np.ndarray:
-    """Return a mask of the cells next to the cells in `mask`, in four directions; both are bool (H, W)."""
+    """Return a mask of the cells above, below, left and right of cells in `mask`; both are bool of shape (H, W)."""
     found = np.zeros_like(mask)
     found[1:] |= mask[:-1]
     found[:-1] |= mask[1:]
@@ -33,7 +34,7 @@ def neighbours(mask: np.ndarray) -> np.ndarray:
 
 
 def agent_rooms(layout: Layout) -> np.ndarray:
-    """Return the floor cells that each agent can reach, bool (2, H, W)."""
+    """Return the floor cells that each agent can reach, bool of shape (2, H, W)."""
     rooms = np.zeros((2, layout.cells), bool)
     for room, cells in zip(rooms, layout.rooms, strict=True):
         room[cells] = True
@@ -41,15 +42,15 @@ def agent_rooms(layout: Layout) -> np.ndarray:
 
 
 def symmetric_images(grid: np.ndarray) -> list[np.ndarray]:
-    """Return a grid, its rotations and their mirror images, eight arrays; some may be equal."""
+    """Return eight arrays, some of them perhaps equal: a grid, its rotations, and the mirror images of these four."""
     return [image for turns in range(4) for image in (np.rot90(grid, turns), np.rot90(grid, turns)[:, ::-1])]
 
 
 @lru_cache(maxsize=64)
 def _wide_images(height: int, width: int) -> tuple[np.ndarray, int]:
-    """Return the cell numbers of each symmetric image not taller than wide, int (images, cells), and its width.
+    """Return the cell numbers of a map's symmetric images that are not taller than wide, and the images' width.
 
-    A square map has eight such images, any other map four.
+    The cell numbers are int of shape (images, cells). A square map has eight such images, any other map four.
     """
     images = symmetric_images(np.arange(height * width).reshape(height, width))
     wide = [image for image in images if image.shape[0] <= image.shape[1]]
@@ -75,12 +76,21 @@ def canonical_map(layout: Layout) -> tuple[str, ...]:
 
 
 def canonical_floor(floor: np.ndarray) -> tuple[str, ...]:
-    """Return the alphabetically first mirror image or rotation of a floor, bool (H, W), not taller than wide."""
+    """Return the rows of the alphabetically first symmetric image of a floor that is not taller than wide.
+
+    Args:
+        floor: bool of shape (H, W).
+    """
     images, width = _wide_images(*floor.shape)
     return _first_map(np.where(floor.ravel()[images], ord(" "), ord("W")).astype(np.uint8), width)
 
 
 def _first_map(images: np.ndarray, width: int) -> tuple[str, ...]:
-    """Return the alphabetically first of several maps, uint8 (maps, cells), as rows of the given width."""
+    """Return the rows of the alphabetically first of several maps.
+
+    Args:
+        images: letters of the maps, uint8 of shape (maps, cells).
+        width: width of all maps.
+    """
     text = min(image.tobytes() for image in images).decode("ascii")
     return tuple(text[start : start + width] for start in range(0, len(text), width))

@@ -1,6 +1,6 @@
 """Random new rooms: a room that both agents share, two rooms with counters between them, or a ring.
 
-Shapes: `H` rows, `W` columns, at most 9 and 11.
+Shapes: `H` rows (at most 9), `W` columns (at most 11).
 """
 
 from __future__ import annotations

@@ -15,11 +15,11 @@ from icrl4aht_generation.layouts.grids import agent_rooms, canonical_floor, symm
 
 @cache
 def published_rooms(tested: bool) -> dict[tuple[str, ...], list[np.ndarray]]:
-    """Return the rooms of the published layouts, without repeats.
+    """Return the rooms of published layouts that are reserved for tests, or those that are not, without repeats.
 
     Args:
-        tested: False for the rooms of asymm_both and cramped_up, the layouts that are only used in training; True for
-            all other rooms. Test layouts with the rooms of asymm_both or cramped_up count as False.
+        tested: False for the rooms of asymm_both and cramped_up, the layouts that are only used in training, although
+            test layouts have these rooms too; True for all other rooms, which are reserved for tests.
 
     Returns:
         Symmetric images of the agents' rooms, each bool (2, H, W), by the `canonical_floor` of the rooms.

@@ -121,7 +121,7 @@ class Learner:
 
 
 def stream_keys(key: Key[Array, ""], environments: int) -> Key[Array, " N"]:
-    """Return the keys of a learner's N environments, given the key of its `Learner.init`."""
+    """Return the keys of a learner's N environments, given the key that is passed to `Learner.init`."""
     return jax.random.split(jax.random.split(key, 3)[1], environments)
 
 

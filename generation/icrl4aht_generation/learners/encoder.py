@@ -54,7 +54,7 @@ class WindowEntries(NamedTuple):
 class GroupedWords(NamedTuple):
     """Observations as word ids of cells, in groups of equal observations that are encoded only once.
 
-    N denotes the number of observations, the product of B.
+    N denotes the number of observations, the product of the batch dimensions B.
 
     Attributes:
         ids: int32 (*B, 25), see `CellWords.ids`.
@@ -83,7 +83,7 @@ class CompactView:
     Attributes:
         kind: kind of the encoder.
         layouts: layouts of the records.
-        agents: agents that observe; an agent comes first in its own state records, see `CellWords.entries`.
+        agents: agents whose observations are encoded, see `CellWords.entries`; records have the observing agent first.
         canonical: whether observations have the canonical channels instead of the layouts' channels.
     """
 
@@ -104,7 +104,7 @@ class CompactView:
 
     @property
     def entries(self) -> np.ndarray:
-        """Indices of the entries of a flat observation that are not always 0, int64 (E,); see `WindowEntries`."""
+        """Indices of the E entries of a flat observation that are not always 0, int64; see `WindowEntries`."""
         return self.words.entries(self.agents)
 
     def __call__(self, record: UInt8[Array, "*B S"], layout_number: Array | None = None) -> Seen:
@@ -156,14 +156,14 @@ def group_equal(seen: Seen) -> Seen:
 
 
 def _hash_words(ids: Int[Array, "N 25"]) -> tuple[Array, Array]:
-    """Return two hashes of each row, uint32 (N,): sums of the word ids times random odd numbers."""
+    """Return two hashes of each row, uint32 of shape (N,): sums of the word ids times random odd numbers."""
     # Odd factors are invertible modulo 2**32, so no word's bits are lost.
     factors = np.random.default_rng(0).integers(2**31, size=(2, VISIBLE), dtype=np.uint32) * 2 + 1
     one, two = ((ids.astype(jnp.uint32) * row).sum(axis=-1, dtype=jnp.uint32) for row in factors)
     return one, two
 
 
-def encoding_log(seen: Seen) -> dict[str, Array]:
+def encoding_metrics(seen: Seen) -> dict[str, Array]:
     """Return metrics of an encoder's input for the log: the share of distinct observations, if known."""
     return {"distinct_observations": seen.groups / seen.group.size} if isinstance(seen, GroupedWords) else {}
 
@@ -274,7 +274,7 @@ class FlatDense(nn.Module):
 
 
 class Conv3x3(nn.Module):
-    """A 3 x 3 SAME convolution of a 5 x 5 patch: (B, 25 * c_in) -> (B, 25 * features)."""
+    """A 3 x 3 SAME convolution of flat 5 x 5 patches, from shape (B, 25 * c_in) to shape (B, 25 * features)."""
 
     features: int
 
@@ -283,14 +283,14 @@ class Conv3x3(nn.Module):
         channels = x.shape[-1] // VISIBLE
         kernel = self.param("kernel", nn.initializers.orthogonal(2**0.5), (3, 3, channels, self.features))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
-        # Tap 9 is a zero after the nine kernel weights, for pairs of cells that are more than one cell apart.
+        # Taps 0 to 8 are the kernel's; tap 9 is zero, for pairs of cells that are more than one cell apart.
         taps = jnp.concatenate([kernel.reshape(9, channels, self.features), jnp.zeros_like(kernel[:1, 0])])
         matrix = taps[_tap_of_cells()].transpose(0, 2, 1, 3).reshape(VISIBLE * channels, VISIBLE * self.features)
         return x @ matrix + jnp.tile(bias, VISIBLE)
 
 
 def _tap_of_cells() -> np.ndarray:
-    """Return the kernel tap of each pair of input and output cells, int (25, 25); 9 if the cells are not adjacent."""
+    """Return the kernel tap for each pair of input and output cells, of shape (25, 25); 9 for pairs too far apart."""
     cell = np.arange(VISIBLE)
     dy = cell[:, None] // WINDOW - cell // WINDOW + 1
     dx = cell[:, None] % WINDOW - cell % WINDOW + 1

@@ -50,7 +50,7 @@ def recurrent_states(
     Args:
         hidden: state before the first step.
         gates: contribution of the input to the reset gate, update gate and candidate.
-        reset: whether the state is zero before a step.
+        reset: whether to set the state to zero before a step.
         recurrent: weights from the state to the reset gate, update gate and candidate.
         bias: bias of the state's contribution to the candidate.
     """
@@ -77,7 +77,7 @@ def _scan_states(hidden, gates, reset, recurrent, bias):
 
 
 def _states_gradient(saved, to_states):
-    """Return the gradients of all inputs of `recurrent_states`, up to twice as fast as JAX's automatic gradients.
+    """Return the gradients for all inputs of `recurrent_states`, up to twice as fast as automatic differentiation.
 
     The loop computes only values that depend on the next step. Everything else, such as the weights' gradient, is one
     operation over all steps.
@@ -134,9 +134,9 @@ class ActorCritic(nn.Module):
 
         Args:
             hidden: recurrent state before the first step.
-            obs: observations (T, N, 5, 5, C), or a compact form of them with axes (T, N).
-            reset: whether an episode starts at a step; the recurrent state is zero there.
-            partner: number of the partner's policy, for a critic with `partners`.
+            obs: observations of shape (T, N, 5, 5, C), or a compact form of the observations with axes (T, N).
+            reset: whether an episode starts at a step; the recurrent state before this step is then zero.
+            partner: index of the partner's policy, for a critic with `partners`.
 
         Returns:
             The recurrent state after the last step, action logits, values.

@@ -95,7 +95,7 @@ def sequences(
     """
     agent, env = np.divmod(agent_slots, rollout.done.shape[1])
     choice = rollout.choices[player]
-    # A reward below that of two button presses, one by each agent, means a wrong delivery.
+    # Two button presses, one by each agent, give a negative reward; a lower reward means a wrong delivery.
     shaped = rollout.shaped[:, env, agent] + forgiveness * (rollout.reward[:, env] < 2 * PRESS_REWARD)
     return Sequences(
         seen=view(slot_records(rollout.record, agent_slots)),
@@ -116,11 +116,14 @@ class RecurrentNetwork(Protocol):
     """Interface of the actor-critics that PPO trains, such as `ActorCritic`."""
 
     def apply(self, variables: Any, /, *inputs: Any) -> Any:
-        """Return the recurrent state after T steps of M sequences, logits (T, M, A), and values (T, M).
+        """Return the recurrent state after T steps of M sequences, logits, and values.
+
+        The logits have shape (T, M, A), the values (T, M).
 
         Args:
             variables: parameters of the network.
-            inputs: recurrent state before the first step (M, H), and `seen`, `reset` and `partner` as in `Sequences`.
+            inputs: recurrent state of shape (M, H) before the first step, then `seen`, `reset` and `partner` as in
+                `Sequences`.
         """
         ...
 

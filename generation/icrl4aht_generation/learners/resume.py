@@ -1,4 +1,4 @@
-"""Save and resume a training run: the saved state, the log, the lock of the folder, and the interval of saves.
+"""Save and resume a training run: the saved state, the log, the lock of the folder, and the times of saving.
 
 Every training run of this project (egos, populations, in-context learners) depends only on its settings and its state
 after the last update. Three parts of this module make the results of a resumed run identical: `StateFile` restores the
@@ -28,7 +28,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as to_bytes
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write, lock_path, process_lock
+from icrl4aht_data.utils.files import atomic_write, lock_file_path, process_lock
 
 METRICS, TIMING = "metrics.jsonl", "timing.jsonl"
 
@@ -46,7 +46,7 @@ class OtherSettingsError(OptionError):
 
 
 def xla_threads() -> int | None:
-    """Return the number of threads that XLA splits one operation over on this CPU; None on other platforms.
+    """Return the number of CPU threads that XLA uses for one operation; None if JAX does not run on a CPU.
 
     The number of threads decides the order of floating-point sums, and so the last bits of all trained parameters. XLA
     reads the number when JAX is first used, from `PJRT_NPROC` or `NPROC`, or else from the available CPU cores.
@@ -111,7 +111,7 @@ def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """
     with ExitStack() as stack:
         try:
-            stack.enter_context(process_lock(lock_path(folder), wait=wait))
+            stack.enter_context(process_lock(lock_file_path(folder), wait=wait))
         except Timeout as error:
             message = f"{folder}: another process works in this folder; wait for that process, or choose another folder"
             raise BusyError(message) from error

@@ -37,7 +37,7 @@ class Choice(NamedTuple):
 
 
 class Player(NamedTuple):
-    """A policy, or several policies of equal shape, in a fixed set of agent slots.
+    """One policy, or several policies with parameters of equal shapes, for a fixed set of agent slots.
 
     Attributes:
         agent_slots: int (M,), a NumPy array, since a compiled rollout needs constant slots.
@@ -56,7 +56,7 @@ class RolloutCarry(NamedTuple):
     Attributes:
         env: states of the N environments.
         ended: bool (N,), whether the last step ended an episode.
-        memories: memories of each player, a pytree with leaves (M, ...).
+        memories: memories of each player, a pytree with leaves of shape (M, ...).
         returns: float32 (N,), return of the running episode so far, without shaping.
     """
 
@@ -114,7 +114,7 @@ def roll_out(
         carry: carry from `init_rollout` or the previous rollout.
         steps: number T of steps.
         key: JAX key for the players' random draws; environments use their own keys.
-        restart: function that may change the states of environments that are `done` and start their next episode.
+        restart: function of states and `done` that may replace the start states of episodes after a `done` step.
     """
     n = carry.ended.shape[0]
     # This permutation sorts the concatenated actions of all players by slot.
@@ -172,7 +172,7 @@ def network_player(
     Args:
         env: the environment.
         network: actor-critic of all policies of the player.
-        params: parameters of one policy for slots (M,); stacked on a leading axis of G policies for slots (G, M).
+        params: parameters of one policy for slots of shape (M,), or of G policies, stacked, for slots of shape (G, M).
         agent_slots: slots of the player, int (M,) or (G, M).
         partner: number of the other agent's policy in each slot, an int array like `agent_slots`, for the critic.
         greedy: whether to take the most probable action instead of a random action; may be a traced bool ().

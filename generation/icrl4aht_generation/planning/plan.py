@@ -1,7 +1,7 @@
 """Estimate the cost of generating a release: counts of steps and bytes, and hours within a factor of about 2.
 
-The network takes most of the time, so its forward pass is measured on this machine. The number of passes of an update
-follows from the hyper-parameters. Stored numbers give the speed of the environment and the time to compile.
+The network takes most of the time, so its forward pass is measured on this machine. The number of forward passes per
+update follows from the hyper-parameters. Stored numbers give the speed of the environment and the time to compile.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ COMPILE_SECONDS = 30.0
 SCRIPTED_SECONDS = 1.0
 """Seconds to write the scripted histories of a task, without compilation, which a family of teammates shares."""
 
-_GRADIENT = 3.1  # time of a gradient step, in forward passes, measured with the profiles `smoke` and `paper`
+_GRADIENT = 3.1  # ratio of the times of a gradient step and a forward pass, measured with profiles `smoke` and `paper`
 
 
 def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
@@ -95,10 +95,10 @@ def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
             layout, count = get_layout(name), profile.task_count(name, source)
             tasks += count
             if source == "ppo":
-                egos += [(layout, profile.ego_on(name))] * (count * profile.learners)
-                kept[source] += count * profile.keep * profile.ego_on(name).episodes * KEPT_STEPS
+                egos += [(layout, profile.ego_config(name))] * (count * profile.learners)
+                kept[source] += count * profile.keep * profile.ego_config(name).episodes * KEPT_STEPS
             else:
-                config = profile.scripted_on(name, source)
+                config = profile.scripted_config(name, source)
                 scripted += [(layout, config)] * count
                 histories[source] += count * config.histories
                 kept[source] += count * config.histories * config.episodes * KEPT_STEPS

@@ -34,18 +34,18 @@ from icrl4aht_generation.populations.select import TeammateSelection, select_tea
 from icrl4aht_generation.populations.train import (
     PopulationJob,
     PopulationRun,
+    cross_play_matrix,
     is_trained,
-    play_matrix,
     suite_checkpoints,
 )
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.teammates.distances import act_on_records, hamming_distances
 from icrl4aht_generation.teammates.instances import published_teammates
 from icrl4aht_generation.teammates.learned import build_learned
-from icrl4aht_generation.teammates.references import REFERENCE_EGOS, stacked_families
+from icrl4aht_generation.teammates.references import REFERENCE_EGOS, stacked_policy_groups
 from icrl4aht_generation.teammates.registry import build_teammate
 
-_EPISODES = 2  # number of episodes with each policy that provide the compared states
+_EPISODES = 2  # number of episodes of each policy from which the compared states are taken
 
 
 def build_suite(
@@ -151,7 +151,7 @@ def report_diversity(
 
 
 def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, console: Console) -> None:
-    returns = play_matrix(suite, layout, algorithm, greedy)
+    returns = cross_play_matrix(suite, layout, algorithm, greedy)
     diagonal = np.eye(len(returns), dtype=bool)
     title = (
         f"{algorithm} on {layout.name}: mean return of {EPISODES_PER_PAIR} episodes of {EPISODE_STEPS} steps, egos in "
@@ -195,13 +195,13 @@ def actions_on_common_states(
         Actions int8 (policies, states), with states = policies x 2 x steps.
     """
     env, key = Environment(layout, steps), jax.random.key(seed)
-    played = [_visited_records(env, *family, key) for family in stacked_families(policies)]
+    played = [_visited_records(env, *family, key) for family in stacked_policy_groups(policies)]
     records = jnp.concatenate(played, axis=1)  # (T, episodes, S)
     return act_on_records(layout, policies, records, seed).reshape(len(policies), -1)
 
 
 def family_distances(distances: np.ndarray, families: Mapping[str, Sequence[int]]) -> np.ndarray:
-    """Return mean distances between F families over all pairs of their policies, float64 (F, F).
+    """Return the mean distance of each pair of F families over all pairs of their policies, float64 of shape (F, F).
 
     Within a family, pairs of a policy with itself also count, as in the paper's formula.
     """
@@ -209,7 +209,7 @@ def family_distances(distances: np.ndarray, families: Mapping[str, Sequence[int]
 
 
 def _visited_records(env: Environment, numbers: list[int], family: Policy, key: Any) -> jax.Array:
-    """Return state records, uint8 (T, policies x 2, S), from episodes of a random ego with each policy of a family."""
+    """Return state records of shape (T, policies x 2, S) from episodes of a random ego with each policy of a family."""
     n = len(numbers) * _EPISODES
 
     @jax.jit

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS, layout_number, track_of
+from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS, layout_number, layout_track
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
-from icrl4aht_data.utils.files import atomic_write, file_hash, lock_path, process_lock
+from icrl4aht_data.utils.files import atomic_write, file_hash, lock_file_path, process_lock
 from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS
 from icrl4aht_generation.populations.train import SuiteCheckpoint, suite_checkpoints
 
@@ -91,7 +91,7 @@ def make_tasks(suite: Path, selections: Sequence[TeammateSelection], split: str)
                 "theta": {"checkpoint": point.path, "sha256": file_hash(suite / point.path / POLICY_WEIGHTS)},
             }
             seed = first + number + (split != "train") * len(selection.train)
-            tasks.append(make_task(track_of(selection.layout), split, selection.layout, entry, seed))
+            tasks.append(make_task(layout_track(selection.layout), split, selection.layout, entry, seed))
     return tasks
 
 
@@ -103,9 +103,9 @@ def write_manifests(suite: Path, selections: Sequence[TeammateSelection]) -> lis
     folder = suite / "manifests"
     folder.mkdir(parents=True, exist_ok=True)
     written = []
-    with process_lock(lock_path(folder)):  # several processes may train one suite
+    with process_lock(lock_file_path(folder)):  # several processes may train one suite
         for track in TRACKS:
-            own = [selection for selection in selections if track_of(selection.layout) == track]
+            own = [selection for selection in selections if layout_track(selection.layout) == track]
             for split in ("train", "heldout"):
                 path, tasks = folder / f"{track}_{split}.jsonl", make_tasks(suite, own, split)
                 if not tasks:

@@ -1,4 +1,4 @@
-"""Training of populations of teammates into a suite, a folder of checkpoints (paper, App. B.1).
+"""Train populations of teammates, and save their checkpoints in a folder, the suite (paper, App. B.1).
 
     SUITE/<layout>/<algorithm>/m<member>/c<checkpoint>/policy.safetensors, policy.json
     SUITE/<layout>/<algorithm>/responses/m<member>/...      best responses, if the algorithm trains them
@@ -26,7 +26,15 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import ALGORITHMS
 from icrl4aht_data.errors import IndexFormatError, OptionError, check_choice
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.files import atomic_write, file_hash, have_hashes, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import (
+    atomic_write,
+    file_hash,
+    hashes_match,
+    json_hash,
+    parse_json,
+    read_text,
+    write_json,
+)
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.checkpoint import (
@@ -61,7 +69,7 @@ from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR, cross_
 POPULATION_SAVE_SECONDS = 60.0
 """Seconds between two saves; a killed run loses at most the work of this time."""
 
-_SELECTIONS = 10  # number of times in a member's training that CoMeDi selects the nearest former member
+_SELECTIONS = 10  # number of times per new member that CoMeDi selects its partner among the earlier members
 RESPONSES = "responses"
 """Folder name of a population's final best responses, if its algorithm trains best responses."""
 
@@ -194,7 +202,7 @@ class PopulationJob:
         record = read_record(self.folder)
         try:
             same = record["settings_hash"] == json_hash(self.population.settings)
-            return same and have_hashes(self.folder, record["files"])
+            return same and hashes_match(self.folder, record["files"])
         except (OSError, KeyError, TypeError):
             return False
 
@@ -281,7 +289,7 @@ class _PopulationTraining:
         started, first = time.perf_counter(), int(state.update)
         for number in range(first, updates):
             if self.run.algorithm == "comedi" and stage and number % max(1, updates // _SELECTIONS) == 0:
-                state = state._replace(params=self._with_nearest_member(state.params, stage, number))
+                state = state._replace(params=self._with_best_partner(state.params, stage, number))
             state, metrics = population.compiled_update(state)
             seconds = time.perf_counter() - started
             line = self._metrics_line(stage, number, metrics)
@@ -310,8 +318,8 @@ class _PopulationTraining:
             **values,
         }
 
-    def _with_nearest_member(self, params: Any, stage: int, number: int) -> Any:
-        """Return the parameters with the frozen policy replaced by the new member's best partner among former members.
+    def _with_best_partner(self, params: Any, stage: int, number: int) -> Any:
+        """Return the parameters; the frozen policy becomes the earlier member that earns most with the new member.
 
         Source: paper, App. B.1, "Partner Selection".
         """
@@ -416,8 +424,8 @@ def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Suit
             yield point
 
 
-def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = False) -> np.ndarray:
-    """Return the mean returns, float64 (K, K), of a population's final policies with each other.
+def cross_play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = False) -> np.ndarray:
+    """Return the mean returns of all pairs of a population's final policies, float64 of shape (K, K).
 
     Args:
         suite: the suite's folder.
@@ -426,8 +434,8 @@ def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = Fals
         greedy: whether teammates take their most probable actions.
 
     Returns:
-        Matrix with egos as rows (best responses, if the algorithm trains them) and members as teammates as columns;
-        the diagonal is self-play.
+        Matrix with a row for each ego (the best responses, if the algorithm trains them) and a column for each member
+        as the teammate; the diagonal is self-play.
 
     Raises:
         OptionError: if the population is not finished.

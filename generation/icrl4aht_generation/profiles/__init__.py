@@ -19,7 +19,7 @@ from icrl4aht_data.utils.options import Count, Natural, replace_options
 from icrl4aht_generation.layouts.families import generate_layouts
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
-from icrl4aht_generation.profiles.profile import Profile, SampledConfig, SpreadConfig, TeammateConfig, Work
+from icrl4aht_generation.profiles.profile import Profile, SampledConfig, SpreadConfig, TeammateConfig, WorkUnit
 
 FOLDER = Path(__file__).parent
 
@@ -55,7 +55,7 @@ class _SampledTasks(_Spread, kw_only=True):
 
 
 class _Generated(Struct, forbid_unknown_fields=True):
-    """Fields of a table of [[tasks.generated]], which adds generated layouts of one family.
+    """Fields of one table [[tasks.generated]]; each table adds generated layouts of one family.
 
     Attributes:
         family, seed, count, split: arguments of `generate_layouts`.
@@ -227,7 +227,7 @@ def _sampled_config(values: _SampledTasks, layouts: tuple[str, ...], sources: tu
 def _teammate_counts(
     section: str, values: _Spread, layouts: tuple[str, ...], sources: tuple[str, ...]
 ) -> dict[str, dict[str, int]]:
-    """Return the numbers of sampled teammates by field of `SpreadConfig` and by layout."""
+    """Return the requested numbers of teammates by field of `SpreadConfig` and by layout."""
     given = {"per_layout": values.per_layout, "validation": values.validation}
     given["ppo"] = values.per_layout if values.ppo is None else values.ppo
     tables: dict[str, Any] = {key: _by_layout(f"{section}.{key}", value, layouts) for key, value in given.items()}
@@ -243,7 +243,7 @@ def _teammate_counts(
     return counts
 
 
-def _check_splits(units: Sequence[Work], sampled: SampledConfig | None, spread: SpreadConfig | None) -> None:
+def _check_splits(units: Sequence[WorkUnit], sampled: SampledConfig | None, spread: SpreadConfig | None) -> None:
     """Check that no teammate of a layout is both in the training and in the validation split.
 
     Raises:
@@ -261,11 +261,11 @@ def _check_splits(units: Sequence[Work], sampled: SampledConfig | None, spread: 
     if shared:
         raise OptionError(
             f"{len(shared)} of the validation tasks have a teammate of a training task, such as {min(shared)}: remove "
-            f"it from tasks.presets, or request fewer validation teammates"
+            f"the teammate from tasks.presets, or request fewer validation teammates"
         )
 
 
-def _teammate_key(work: Work) -> tuple[Any, ...]:
+def _teammate_key(work: WorkUnit) -> tuple[Any, ...]:
     """Return a key that is equal for units with the same teammate, layout and recipes."""
     return work.task.layout.name, work.task.recipes, teammate_id(work.task.teammate)
 

@@ -20,8 +20,8 @@ _Power = Annotated[float, Meta(gt=0, le=10)]
 class NoiseConfig:
     """Options of histories by noise distillation: the chance of a random action falls over a history's episodes.
 
-    The chance is `start` until the share `begin` of the episodes, and `end` from the share `finish` on. In between, x
-    grows from 0 to 1, and the chance is `end + (start - end) * (1 - x) ** power`.
+    The chance is `start` until the share `begin` of the episodes has passed, and `end` after the share `finish`. In
+    between, x grows linearly from 0 to 1, and the chance is `end + (start - end) * (1 - x) ** power`.
 
     Attributes:
         histories: number of histories of each task.

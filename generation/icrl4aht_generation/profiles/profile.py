@@ -15,7 +15,7 @@ from icrl4aht_data.benchmark.facts import (
     PREFERENCE,
     PREFERENCE_LAYOUTS,
     SOURCES,
-    track_of,
+    layout_track,
 )
 from icrl4aht_data.benchmark.tasks import Task, make_task, manifest_path, read_tasks
 from icrl4aht_data.errors import OptionError
@@ -44,8 +44,8 @@ _GENERATED_DRAWS = {"train": 4, "validation": 5, "test": 6}
 """Base seed of teammates on generated layouts by split; their parameters are sampled from `Heuristic.diverse`."""
 
 
-class Work(NamedTuple):
-    """A unit of work: the histories of one task, by one learner or script, which become one artefact.
+class WorkUnit(NamedTuple):
+    """A unit of work: one learner or script generates histories of one task, which are stored as one artefact.
 
     Attributes:
         task: task of the histories.
@@ -65,7 +65,7 @@ class Work(NamedTuple):
 
 @dataclass(frozen=True)
 class TeammateConfig:
-    """Sizes of the suite of learned teammates for each layout; the defaults are the paper's tables (App. B.1).
+    """Sizes of the suite of learned teammates for each layout; the defaults are from the paper (App. B.1).
 
     Attributes:
         members: number of policies in each algorithm's population.
@@ -217,11 +217,11 @@ class Profile:
         except ValueError as error:
             raise OptionError(f"profile {self.name} with the given options: {error}") from error
 
-    def ego_on(self, layout: str) -> PPOConfig:
+    def ego_config(self, layout: str) -> PPOConfig:
         """Return the hyper-parameters of the egos on a layout (short name)."""
         return self.ego_layouts.get(layout, self.ego)
 
-    def scripted_on(self, layout: str, source: str) -> NoiseConfig:
+    def scripted_config(self, layout: str, source: str) -> NoiseConfig:
         """Return the options of a layout (short name) for the source "noise" or "search"."""
         common = self.search if source == "search" else self.noise
         return self.scripted_layouts.get(source, {}).get(layout, common)
@@ -230,7 +230,7 @@ class Profile:
         """Return the names of a source's layouts."""
         return self.preference if source == "search" else self.layouts
 
-    def units(self, learned: Sequence[Task] = ()) -> list[Work]:
+    def units(self, learned: Sequence[Task] = ()) -> list[WorkUnit]:
         """Return all units of work of the profile, by source and layout.
 
         Args:
@@ -247,7 +247,7 @@ class Profile:
                 units += self._work_units(tasks, source)
         return units
 
-    def units_of(self, tasks: Sequence[Task], sources: Mapping[str, str]) -> list[Work]:
+    def units_of(self, tasks: Sequence[Task], sources: Mapping[str, str]) -> list[WorkUnit]:
         """Return the units of work of given tasks.
 
         Args:
@@ -268,9 +268,9 @@ class Profile:
             units += self._work_units([task], source)
         return units
 
-    def _work_units(self, tasks: Sequence[Task], source: str) -> list[Work]:
+    def _work_units(self, tasks: Sequence[Task], source: str) -> list[WorkUnit]:
         learners = self.learners if source == "ppo" else 1
-        return [Work(task, source, learner) for task in tasks for learner in range(learners)]
+        return [WorkUnit(task, source, learner) for task in tasks for learner in range(learners)]
 
     def task_count(self, layout: str, source: str) -> int:
         """Return the number of tasks of a source on a layout, assuming enough good teammates in every population."""
@@ -286,7 +286,7 @@ class Profile:
                 make_task(task.track, task.split, layout, task.teammate, first + number, task.recipes)
                 for number, task in enumerate(own)
             ]
-        track, first = track_of(layout), self.layouts.index(layout) * len(self.presets)
+        track, first = layout_track(layout), self.layouts.index(layout) * len(self.presets)
         split = "train" if layout in LAYOUT_NAMES else split_of(get_layout(layout))
         tasks = [
             make_task(track, split, layout, heuristic_teammate("utility_greedy", preset, number), first + number)

@@ -16,15 +16,15 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.files import check_folder_content, process_lock
 from icrl4aht_data.utils.progress import bar_updater, progress_bars
-from icrl4aht_data.writing.card import card_facts, print_learning, teammate_name
+from icrl4aht_data.writing.card import card_facts, print_learning_curves, teammate_name
 from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.jobs.job import FAILED, FailedJobsError
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
 from icrl4aht_generation.populations.build import build_suite
 from icrl4aht_generation.populations.select import THRESHOLD, make_tasks
-from icrl4aht_generation.profiles import Profile, Work
-from icrl4aht_generation.releases.measures import learned_headroom, teammate_facts
+from icrl4aht_generation.profiles import Profile, WorkUnit
+from icrl4aht_generation.releases.measures import learned_reference_returns, teammate_facts
 from icrl4aht_generation.releases.package import check_release_folder, package_release
 
 SUITE = "suite"
@@ -91,13 +91,13 @@ def build_releases(
                 )
                 package_release(artefacts, release, units, profile, suite, kind, facts, left_out, *steps)
         for release in releases:
-            print_learning(card_facts(release), console)
+            print_learning_curves(card_facts(release), console)
     return releases
 
 
 def train_teammates(
     profile: Profile, suite: Path, seed: int, console: Console, options: QueueOptions
-) -> tuple[list[Work], dict[str, ReferenceEgos], list[LeftOutTask]]:
+) -> tuple[list[WorkUnit], dict[str, ReferenceEgos], list[LeftOutTask]]:
     """Train the learned teammates of a profile, then return the profile's units of work.
 
     Returns:
@@ -111,7 +111,7 @@ def train_teammates(
         return profile.units(), {}, []
     selections = build_suite(profile, suite, profile.algorithms, seed, console, options)
     learned = make_tasks(suite, selections, "train")
-    headroom = learned_headroom(learned, suite)
+    headroom = learned_reference_returns(learned, suite)
     of_teammate = {task.teammate_key: headroom[task.task_id] for task in learned}
     units, left_out = [], []
     for work in profile.units(learned):

@@ -28,7 +28,7 @@ class Comparison:
     """Result of a comparison of two folders.
 
     Attributes:
-        files: number of different file paths in the two folders.
+        files: number of distinct file paths in the two folders together.
         differences: description of the difference by file.
         xla_threads: recorded numbers of XLA threads that generated each folder; the last bits of results depend on the
             number.

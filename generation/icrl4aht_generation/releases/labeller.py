@@ -1,4 +1,4 @@
-"""Choose the ego checkpoint that labels a task's histories, by returns with the task's teammate.
+"""Choose the ego checkpoint that labels a task's histories, by its return with the task's teammate.
 
 The labels are greedy actions. The labeller is the last checkpoint, as in the paper, unless an earlier checkpoint earns
 clearly more with greedy actions. A policy that was trained with random actions can get stuck in "stay" when it acts
@@ -140,11 +140,11 @@ def _measure(checkpoints: list[Path], task: Task, suite: Path) -> CheckpointRetu
 
 @lru_cache(maxsize=8)
 def _compiled_returns(layout: Layout, widths: Widths, teammate: Policy) -> Callable[..., jax.Array]:
-    """Return a compiled function that measures the returns, float32 (LABEL_EPISODES,), of an ego with a teammate.
+    """Return a compiled function that measures the returns of an ego with a teammate, one for each episode.
 
-    Its arguments are the ego's parameters, whether the ego acts greedily, the teammate's parameters and a key. Returns
-    are over the first `KEPT_STEPS` steps of episodes that are equal for all egos. All teammates of one family on one
-    layout share a compilation.
+    The arguments of the function are the ego's parameters, whether the ego acts greedily, the teammate's parameters and
+    a key. The result is float32 of shape (LABEL_EPISODES,). A return is the sum of rewards over the first `KEPT_STEPS`
+    steps of an episode; all egos play the same episodes. All teammates of one family on one layout share a compilation.
     """
     env, network, n = Environment(layout, KEPT_STEPS), ActorCritic(widths), LABEL_EPISODES
 

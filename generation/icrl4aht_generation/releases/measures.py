@@ -1,8 +1,8 @@
 """Measurements of a release's teammates: returns of reference egos with each teammate, and the nearest test teammate.
 
-Measurements of sampled teammates are in `teammates/draws.jsonl`; those of an existing release's teammates are in its
-provenance. Other teammates are measured once, and these measurements are stored next to the artefacts, in hidden files
-`.<layout>.teammates.json`.
+The measurements of sampled and spread teammates are in `teammates/draws.jsonl` and `teammates/spread.jsonl`. The
+provenance of an existing release contains the measurements of its teammates. Other teammates are measured once, and
+their measurements are stored next to the artefacts, in hidden files `.<layout>.teammates.json`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.checkpoints import checkpoint_folder
 from icrl4aht_data.format.info import LeftOutTask
-from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEgos, read_provenance
+from icrl4aht_data.format.provenance import NearestTestTeammate, Provenance, ReferenceEgos, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
@@ -47,7 +47,7 @@ T = TypeVar("T")
 _SEED = 12  # seed of episodes of a learned teammate with its training partner
 
 
-def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceEgos]:
+def learned_reference_returns(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceEgos]:
     """Measure the returns of reference egos with learned teammates.
 
     Args:
@@ -77,7 +77,7 @@ def _training_partner(folder: Path) -> Path:
 
 @lru_cache(maxsize=8)
 def _compiled_self_play(layout: Layout, ego: Policy, mate: Policy) -> Callable[[Any, Any], jax.Array]:
-    """Return a compiled function from both policies' parameters to the returns of their episodes, (episodes,)."""
+    """Return a compiled function of both policies' parameters that returns an array with the return of each episode."""
     env = Environment(layout, KEPT_STEPS)
 
     @jax.jit
@@ -102,7 +102,7 @@ class TeammateFacts(NamedTuple):
     """
 
     references: ReferenceEgos
-    nearest: NearestTest | None
+    nearest: NearestTestTeammate | None
 
 
 def teammate_facts(
@@ -128,7 +128,7 @@ def teammate_facts(
         if draw is not None:
             distance, _, name = min((draw.distance, 0, draw.nearest), (draw.other_distance, 1, draw.other))
             egos = ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES)
-            found[key] = TeammateFacts(egos, NearestTest(name, distance, draw.behaviour))
+            found[key] = TeammateFacts(egos, NearestTestTeammate(name, distance, draw.behaviour))
         elif made is not None and made.references is not None:
             found[key] = TeammateFacts(made.references, made.nearest_test)
     unknown = (key for key in groups if key not in found)
@@ -190,11 +190,11 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
     heuristics = [task for task in tasks if task.teammate_family != "rl"]
     missing = [task for task in learned if task.task_id not in headroom]
     returns = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
-    returns |= learned_headroom(missing, suite)
+    returns |= learned_reference_returns(missing, suite)
     for task in heuristics:  # one at a time, because tasks may have different recipes
         (egos,) = reference_returns(task.layout, [build_teammate(None, task.teammate)])
         returns[task.task_id] = reference_egos(egos)
-    nearest: dict[str, NearestTest] = {}
+    nearest: dict[str, NearestTestTeammate] = {}
     layout = tasks[0].layout
     if learned and layout.name in TESTED_ON:  # other layouts have no test teammates to compare with
         mates = [build_teammate(layout, task.teammate, suite=suite) for task in learned]

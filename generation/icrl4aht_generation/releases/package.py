@@ -26,13 +26,19 @@ from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.writing.card import CURVES_FIGURE, teammate_name
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder, check_target
-from icrl4aht_generation.collection.curate import filter_report, oracle_labels, relabel, select_streams, stream_returns
+from icrl4aht_generation.collection.curate import (
+    filter_report,
+    greedy_labels,
+    oracle_labels,
+    select_streams,
+    stream_returns,
+)
 from icrl4aht_generation.collection.task import TEAMMATE_NOISE
 from icrl4aht_generation.collection.task_folder import HISTORY_ARRAYS, METADATA
 from icrl4aht_generation.learners.checkpoint import load_policy
 from icrl4aht_generation.populations.select import THRESHOLD
 from icrl4aht_generation.populations.train import population_threads
-from icrl4aht_generation.profiles import Profile, Work
+from icrl4aht_generation.profiles import Profile, WorkUnit
 from icrl4aht_generation.releases.labeller import choose_labeller
 from icrl4aht_generation.releases.measures import (
     TeammateFacts,
@@ -63,12 +69,12 @@ class TaskHistories(NamedTuple):
 
     @property
     def recorded_returns(self) -> np.ndarray:
-        """Episode returns of all streams of all learners, float64 (N, E)."""
+        """Episode returns of all streams of all learners, float64 of shape (N, E)."""
         return np.concatenate(self.returns)
 
     @property
     def kept_returns(self) -> np.ndarray:
-        """Episode returns of the selected streams, float64 (n, E)."""
+        """Episode returns of the selected streams, float64 of shape (n, E)."""
         return np.concatenate([own[streams] for own, streams in zip(self.returns, self.streams, strict=True)])
 
     def left_out(self, reason: str) -> LeftOutTask:
@@ -82,7 +88,7 @@ class TaskHistories(NamedTuple):
 
 
 def select_histories(
-    artefacts: Path, units: Sequence[Work], profile: Profile, facts: TeammateFacts, *, headroom: bool
+    artefacts: Path, units: Sequence[WorkUnit], profile: Profile, facts: TeammateFacts, *, headroom: bool
 ) -> TaskHistories | LeftOutTask:
     """Select the histories of a task for a release.
 
@@ -123,7 +129,7 @@ def select_histories(
 def package_release(
     artefacts: Path,
     target: Path,
-    units: Sequence[Work],
+    units: Sequence[WorkUnit],
     profile: Profile,
     suite: Path,
     kind: Kind,
@@ -260,7 +266,7 @@ def _new_task(
         expert=expert,
         **own,
     )
-    # Store the oracle's actions if the oracle earns at least the histories' final return, or if they are the labels.
+    # Store the oracle's actions if they are the labels, or if the oracle earns at least the histories' final return.
     with_oracle = profile.oracle_actions and made.is_oracle_useful(float(curve_ends(found.kept_returns)[1].mean()))
 
     def load() -> Iterator[NewHistory]:
@@ -285,12 +291,12 @@ def _script_label_record(source: str, references: ReferenceEgos) -> ExpertLabels
 
 
 def _label_function(found: TaskHistories, labeller: Path | None) -> Callable[[int, np.ndarray], np.ndarray]:
-    """Return a function from a stream's number and states, uint8 (T, S), to expert actions, int8 (T,)."""
+    """Return a function of a stream's number and states, uint8 of shape (T, S), that returns T expert actions, int8."""
     if labeller is None:
         script = np.load(found.folders[0] / "script_actions.npy", mmap_mode="r")
         return lambda stream, states: script[stream]
     network, params, _ = load_policy(labeller)
-    return lambda stream, states: relabel(found.task.layout, network, params, states)
+    return lambda stream, states: greedy_labels(found.task.layout, network, params, states)
 
 
 def _recorded_histories(found: TaskHistories) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:

@@ -28,7 +28,7 @@ from icrl4aht_data.benchmark.facts import (
     TESTED_ON,
 )
 from icrl4aht_data.errors import check_choice
-from icrl4aht_data.format.provenance import NearestTest
+from icrl4aht_data.format.provenance import NearestTestTeammate
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.state import record_size
@@ -49,13 +49,13 @@ from icrl4aht_generation.teammates.references import (
     REFERENCE_EGOS,
     play_reference_egos,
     reference_returns,
-    stacked_families,
+    stacked_policy_groups,
 )
 from icrl4aht_generation.teammates.registry import (
     HEURISTIC_FAMILIES,
     build_teammate,
     sample_teammate,
-    with_equal_parameters,
+    with_equal_parameter_names,
 )
 from icrl4aht_generation.teammates.spread import (
     MOST_CHOSEN,
@@ -86,11 +86,11 @@ DRAW_NUMBERS = [
 """Family, base_seed and theta_id of each sampled teammate of a layout."""
 
 
-def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest]:
+def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTestTeammate]:
     """Return the test teammate of a layout that acts most like each of the given teammates.
 
-    Each result also has the share of states in which the two act differently, and the number of the given teammate's
-    behaviour, counted in the order of the policies. Policies with equal functions are compiled once.
+    Each result also has the Hamming distance of the two teammates, and the number that `group_behaviours` gives to the
+    teammate's behaviour. Policies with equal functions are compiled once.
 
     Raises:
         UnknownNameError: if the benchmark does not have the layout.
@@ -100,7 +100,7 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
     distances = distances_to_tests(tested, actions)
     nearest = distances.argmin(axis=1)
     return [
-        NearestTest(INSTANCE_NAMES[k], round(float(distances[number, k]), _DIGITS), behaviour)
+        NearestTestTeammate(INSTANCE_NAMES[k], round(float(distances[number, k]), _DIGITS), behaviour)
         for number, (k, behaviour) in enumerate(zip(nearest, group_behaviours(actions), strict=True))
     ]
 
@@ -126,7 +126,7 @@ def common_states(layout: Layout, episodes: int = _EPISODES) -> tuple[UInt8[Arra
 def instance_policies(layout: Layout) -> list[Policy]:
     """Return the test instances for a layout, by family and number, as policies that see a `Situation`.
 
-    For a training layout, these are the instances of the layout on which its models are tested, see `TESTED_ON`.
+    A training layout without test tasks has the instances of the test layout that `TESTED_ON` assigns to it.
     """
     tested = TESTED_ON.get(layout.name, layout.name)
     entries = [entry for family in TESTED_FAMILIES for entry in published_teammates(tested, family)]
@@ -165,7 +165,7 @@ def act_on_records(layout: Layout, policies: Sequence[Policy], records: Array, s
     """
     keys = jax.random.split(jax.random.key(seed), records.shape[1])
     actions = np.zeros((len(policies), *records.shape[:2]), np.int8)
-    for numbers, family in stacked_families(policies):
+    for numbers, family in stacked_policy_groups(policies):
         tables, seen = layout.tables, records
         if family.sees == "situation":  # padded, so all layouts share one compilation
             tables, _, positions = padded_layout(layout)
@@ -176,9 +176,9 @@ def act_on_records(layout: Layout, policies: Sequence[Policy], records: Array, s
 
 @lru_cache(maxsize=16)
 def _compiled_actions(family: Policy) -> Callable[..., Array]:
-    """Return a compiled function of stacked parameters, records, keys and tables.
+    """Return a compiled function of stacked parameters, state records, keys and tables that returns actions.
 
-    The function returns actions on the records, int8 (policies, T, episodes).
+    The function returns the actions of each policy on the records, int8 of shape (policies, T, episodes).
     """
 
     @jax.jit
@@ -216,13 +216,13 @@ def distances_to_tests(tested: np.ndarray, actions: np.ndarray) -> np.ndarray:
 
 
 def hamming_distances(actions: np.ndarray) -> np.ndarray:
-    """Return the share of N states on which two of P policies act differently, float64 (P, P)."""
+    """Return the share of N states on which two policies act differently, for all pairs, float64 of shape (P, P)."""
     # The matrix is computed row by row, because all pairs at once would take gigabytes.
     return np.array([(actions != own).mean(axis=1) for own in actions]).reshape(len(actions), len(actions))
 
 
 def group_behaviours(actions: np.ndarray) -> list[int]:
-    """Return a number for the behaviour of each policy, given the policies' actions, int8 (policies, ...).
+    """Return a number for the behaviour of each policy, given all policies' actions, int8 of shape (policies, ...).
 
     Policies are compared with the first policy of each behaviour so far. If the distance is below `SAME_BEHAVIOUR`, the
     policy has this behaviour; else it starts a new behaviour.
@@ -255,7 +255,7 @@ def fill_table(
         on_layout(number, name)
         own = [row for row in rows if row.layout == name]
         complete = len(own) == len(DRAW_NUMBERS)
-        if spread:  # a list that was chosen from other candidates is outdated
+        if spread:  # a list chosen from another number of candidates is outdated
             complete = [row.tried for row in own] == [len(candidates)]
         if overwrite or not complete:
             layout = get_layout(name)
@@ -302,7 +302,7 @@ def _measure(
         episodes: number of episodes of the common states, see `common_states`.
     """
     records, tested = common_states(layout, episodes)
-    policies = [build_teammate(None, entry) for entry in with_equal_parameters(entries)]
+    policies = [build_teammate(None, entry) for entry in with_equal_parameter_names(entries)]
     actions = act_on_records(layout, policies, records)
     return actions, distances_to_tests(tested, actions), reference_returns(layout, policies)
 

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import Struct
 
-from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS, layout_order
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS, layout_sort_key
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice, unknown_name
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -48,7 +48,7 @@ DIVERSE_DISTANCE = 0.1
 
 
 def ranges_of(base_seed: int) -> str:
-    """Return the name of the ranges for draws of a seed: "train" or "diverse", see `sample_teammate`."""
+    """Return the name of the parameter ranges for a base seed: "train" or "diverse", see `sample_teammate`."""
     return "diverse" if base_seed in _DIVERSE_SEEDS.values() else "train"
 
 
@@ -90,8 +90,8 @@ class Draw(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def order(self) -> tuple[Any, ...]:
-        """Sort key in the table: by layout, family, seed and theta_id."""
-        return layout_order(self.layout), list(HEURISTIC_FAMILIES).index(self.family), self.base_seed, self.theta_id
+        """Sort key of the table's rows: layout, family, seed and theta_id."""
+        return layout_sort_key(self.layout), list(HEURISTIC_FAMILIES).index(self.family), self.base_seed, self.theta_id
 
     @property
     def admissible(self) -> bool:
@@ -146,7 +146,7 @@ def drawn_teammates(
 
     The families take turns. Only admissible draws are chosen, and draws without headroom only if no admissible draw on
     the layout has headroom. Each family prefers draws that behave differently from all test instances, then one draw of
-    each behaviour, then draws with a large difference between the reference egos, then a small theta_id.
+    each behaviour, then draws with a large difference between the reference egos' returns, then a small theta_id.
 
     Args:
         layout: a training layout.
@@ -176,9 +176,9 @@ def drawn_teammates(
 
 
 def validation_tasks(track: str) -> list[Task]:
-    """Return the tasks of split `validation` for model selection: up to four for each training layout, with seed 1.
+    """Return the tasks of split `validation` for model selection: up to four for each training layout.
 
-    Layouts have no such tasks if every draw of this seed behaves like a test instance.
+    The teammates are draws with base_seed 1. A layout has no such tasks if all these draws behave like test instances.
     """
     tasks = []
     for layout in (layout for layout in TRACKS[track]["validation"] if layout in TESTED_ON):
@@ -218,7 +218,7 @@ def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
 
 
 def equal_parameters(theta: Mapping[str, float], other: Mapping[str, float]) -> bool:
-    """Return whether parameters are equal up to the last digit, which may differ between compilations."""
+    """Return whether parameters are equal up to rounding errors, which may differ between compilations."""
     return theta.keys() == other.keys() and all(math.isclose(theta[name], other[name], rel_tol=1e-6) for name in theta)
 
 

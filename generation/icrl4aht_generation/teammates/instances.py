@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, layout_track
 from icrl4aht_data.benchmark.tasks import Task, make_task, manifest_path, read_tasks
 from icrl4aht_data.errors import check_choice
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -56,6 +56,6 @@ def published_task(layout: str, teammate: str) -> Task:
     check_choice("teammate", teammate, INSTANCE_NAMES)
     family, number = divmod(INSTANCE_NAMES.index(teammate), INSTANCES)
     entry = published_teammates(name, TESTED_FAMILIES[family])[number]
-    track = track_of(name)
+    track = layout_track(name)
     split = "test" if name in TRACKS[track]["test"] else "train"
     return make_task(track, split, name, entry, seed=0)

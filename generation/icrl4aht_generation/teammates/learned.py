@@ -83,7 +83,7 @@ def build_learned_entry(layout: Layout, teammate: dict[str, Any], suite: Path | 
 
 @lru_cache(maxsize=16)
 def _acting_functions(widths: Widths, action: Action):
-    """Return the functions `init` and `act` of policies; equal functions let checkpoints share compilations."""
+    """Return the functions `init` and `act` of policies, cached, so checkpoints of equal widths share compilations."""
     network = ActorCritic(widths, critic=False)
 
     def init(params, key: Key[Array, ""]) -> Array:

@@ -64,7 +64,7 @@ def _dishes_and_teammates(layout: Layout, split: str, number: int, part: str) ->
         yield from ((dish, mates[(3 * k + number) % len(mates)]) for k, dish in enumerate(dishes * 4))
         return
     for k in range(_TEST_TASKS[part] if split == "test" else len(TESTED_FAMILIES)):
-        # `number` is multiplied by 7 or 1, so over all layouts every dish occurs with teammates of several families.
+        # Each layout shifts dishes by 7 and teammates by 1, so every dish occurs with teammates of several families.
         yield dishes[(3 * k + 7 * number) % len(dishes)], mates[(6 * k + number) % len(mates)]
 
 

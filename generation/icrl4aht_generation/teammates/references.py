@@ -73,7 +73,7 @@ def play_reference_egos(
     Args:
         layout: layout of the episodes.
         teammates: policies that play agent 1; at least one.
-        pairs: ego, one of `REFERENCE_EGOS`, and index of the teammate in each of N episodes.
+        pairs: for each of N episodes, a name from `REFERENCE_EGOS` and the index of a teammate.
         keys: key of each episode.
         field: field of `Rollout` to return.
 
@@ -81,7 +81,7 @@ def play_reference_egos(
         State records before each step, uint8 (100, N, S), or rewards, float32 (100, N). Records are those of
         `padded_layout` if all teammates see a `Situation`.
     """
-    families = list(stacked_families(teammates))
+    families = list(stacked_policy_groups(teammates))
     # Policies that see observations or state records of one layout need the layout without padding.
     every = all(family.sees == "situation" for _, family in families)
     tables, expert, _ = (padded_layout if every else unpadded_layout)(layout)
@@ -95,7 +95,10 @@ def play_reference_egos(
 def _compiled_play(
     families: tuple[tuple[tuple[int, ...], Policy], ...], pairs: tuple[tuple[str, int], ...], field: str
 ) -> Callable[..., Array]:
-    """Return a compiled function from tables, parameters of oracle and families, and keys to a field of the rollout."""
+    """Return a compiled function that plays the pairs and returns a field of the rollout.
+
+    The function's arguments are the layout's tables, the oracle's parameters, each family's parameters, and the keys.
+    """
     ego_of, mate_of = (np.array(column) for column in zip(*pairs, strict=True))
 
     @jax.jit
@@ -134,7 +137,7 @@ REFERENCE_EGOS = {
 """Policies of the egos "stay", "random" (uniform over the six actions) and "oracle" by name."""
 
 
-def stacked_families(policies: Sequence[Policy]) -> Iterator[tuple[list[int], Policy]]:
+def stacked_policy_groups(policies: Sequence[Policy]) -> Iterator[tuple[list[int], Policy]]:
     """Yield groups of policies with equal functions: their indices, and one policy with stacked parameters."""
     groups = grouped(range(len(policies)), lambda number: policies[number]._replace(params=()))
     for numbers in groups.values():

@@ -84,7 +84,7 @@ def _sampled_theta(heuristic: Heuristic, split: str, seed: str) -> dict[str, flo
     key, own = jax.random.split(jax.random.key(int(digest[:8], 16)))
     theta = heuristic.defaults | heuristic.presets[presets[_randint(own, len(presets))]]
     for name, value in theta.items():
-        key, own = jax.random.split(key)  # fixed parameters also use a key, so each draw is independent of other ranges
+        key, own = jax.random.split(key)  # also for fixed parameters, so no draw depends on which others have ranges
         if isinstance(ranges.get(name), list):
             theta[name] = ranges[name][_randint(own, len(ranges[name]))]
         elif name in ranges:
@@ -141,7 +141,7 @@ def build_teammate(
     return _family(teammate["family"]).build(layout, teammate["theta"], slot, noise)
 
 
-def with_equal_parameters(teammates: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def with_equal_parameter_names(teammates: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Add `RANDOM_ACTIONS` to all entries of a family if any entry has it, so they share a compilation."""
     mixed = {entry["family"] for entry in teammates if RANDOM_ACTIONS in entry["theta"]}
     return [

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, layout_order
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, layout_sort_key
 from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_generation.teammates.draws import Draw, equal_parameters, find_draw, read_measured
@@ -49,7 +49,7 @@ _MIXED_DRAWS = 8
 _CHANCES = (0.25, 0.5, 0.75)
 """Chances of a random action, which mixtures use in turn."""
 
-_FIRST_DRAW, _FIRST_MIXTURE = 100, 200  # first numbers of sampled and of mixed candidates
+_FIRST_DRAW, _FIRST_MIXTURE = 100, 200  # first theta_id of sampled candidates, and of mixtures
 
 MOST_CHOSEN = 45
 """Maximum number of chosen teammates on a layout."""
@@ -77,8 +77,8 @@ _SPECIALISTS: dict[str, tuple[dict[str, float], ...]] = {
         {"behavior_mode": INVADER, "split_mode": STATIONS, "strictness": 1.0, "shared_margin": 0},
     ),
     "assembly_line": (
-        {"role_mode": RUNNER, "handoff_style": 1},  # the teammate only fetches, and hands over at the middle counters
-        {"role_mode": RUNNER, "handoff_style": 2},  # the teammate only fetches, and hands over near its partner
+        {"role_mode": RUNNER, "handoff_style": 1},  # the teammate only carries ingredients to pots or central counters
+        {"role_mode": RUNNER, "handoff_style": 2},  # the teammate only carries ingredients to pots or near its partner
         {"role_mode": PLATER, "task_abandon_prob": 0.5},
         {"task_abandon_prob": 1.0},  # the teammate puts down whatever it fetches
         {"wrong_action_prob": 1.0},
@@ -135,7 +135,7 @@ class SpreadTeammate(Struct, forbid_unknown_fields=True):
 
 
 class LayoutSpread(Struct, forbid_unknown_fields=True):
-    """Teammates chosen for a layout, in the order in which they were chosen, and numbers of candidates.
+    """Teammates chosen for a layout, in the order in which they were chosen, and counts of candidates.
 
     Attributes:
         layout: short name of a training layout.
@@ -154,8 +154,8 @@ class LayoutSpread(Struct, forbid_unknown_fields=True):
 
     @property
     def order(self) -> tuple[Any, ...]:
-        """Sort key in the table: the benchmark's order of layouts."""
-        return layout_order(self.layout)
+        """Sort key of the table's rows: the benchmark's order of layouts."""
+        return layout_sort_key(self.layout)
 
     def of_split(self, split: str) -> list[SpreadTeammate]:
         """Return the chosen teammates of split "train" or "validation", in order of choice."""

@@ -20,11 +20,11 @@ def constant_policy(action: int) -> Policy:
 
 def test_bandit_and_dark_room_give_expected_rewards():
     means = jnp.array([[0.0, 1.0, 0, 0, 0], [1.0, 0.0, 0, 0, 0]])
-    actions, rewards = worlds.play_world(worlds.bandit(), constant_policy(1), means, 0, 6)
+    actions, rewards = worlds.play_small_tasks(worlds.bandit(), constant_policy(1), means, 0, 6)
     assert actions.tolist() == [[1] * 6] * 2
     assert rewards.tolist() == [[1] * 6, [0] * 6]
     above, corner = worlds.MIDDLE - worlds.SIDE, 0
-    _, rewards = worlds.play_world(
+    _, rewards = worlds.play_small_tasks(
         worlds.dark_room(), constant_policy(0), jnp.array([above, corner]), 0, 2 * worlds.ROOM_STEPS
     )
     episode = [1] + [0] * (worlds.ROOM_STEPS - 1)  # the agent moves up past the goal to the wall
@@ -41,7 +41,7 @@ def test_source_algorithms_improve_within_a_history():
         regret = (means.max(axis=1, keepdims=True) - np.take_along_axis(means, actions, axis=1)).sum(axis=1).mean()
         assert regret < uniform / 2
     goals = np.delete(np.arange(worlds.CELLS), worlds.MIDDLE)
-    cells, actions, rewards = worlds.search_histories(np.tile(goals, 10), 20, rng)
+    cells, actions, rewards = worlds.dark_room_histories(np.tile(goals, 10), 20, rng)
     np.testing.assert_array_equal(cells.reshape(-1, worlds.ROOM_STEPS)[:, 0], worlds.MIDDLE)
     shares = rewards.reshape(len(cells), 20, -1).sum(axis=-1) / worlds.best_return(np.tile(goals, 10))[:, None]
     assert shares[:, 0].mean() < 0.3

@@ -68,7 +68,7 @@ def compiled_programs():
 
 @pytest.fixture(scope="module")
 def solo_returns(compiled_programs):
-    """Return two arrays of returns (tasks, episodes), for the ego that stays and the ego that acts randomly."""
+    """Return the returns of an ego that stays and of one that acts randomly, each of shape (tasks, episodes)."""
 
     def play(mode):
         results = evaluate("fixed", ego(mode), TASKS, FOUR, programs=compiled_programs)
@@ -86,8 +86,8 @@ def test_memory_and_partner_controls_equal_hand_computed_differences(solo_return
     plain = np.array([[stays[0, 0], *wanders[0, 1:]], stays[1]])
     np.testing.assert_array_equal([result.returns[0] for result in found.plain], plain)
     np.testing.assert_array_equal([result.returns[0] for result in found.cleared], stays)
-    # Task 0: the teammate of task 1 plays first, the ego earns reward, and stays still once its own teammate plays.
-    # Task 1: the teammate of task 0 plays first, the ego earns nothing, and acts randomly once its own teammate plays.
+    # Task 0: the teammate of task 1 plays first, the ego earns reward, and stays when its own teammate plays.
+    # Task 1: the teammate of task 0 plays first, the ego earns nothing, and acts randomly when its own teammate plays.
     swapped = np.array([result.returns[0] for result in found.swapped])
     np.testing.assert_array_equal(swapped[:, 2:], [stays[0, 2:], wanders[1, 2:]])
     np.testing.assert_array_equal(found.memory[:, 0], (plain - stays).mean(axis=1))

@@ -25,7 +25,7 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_tasks
 
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.reference_returns import read_headroom
+from icrl4aht_data.benchmark.reference_returns import read_reference_returns
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
@@ -60,11 +60,11 @@ def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_retu
     first = evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
     started, played = [], []
 
-    def make_recorded_ego(layout):
+    def log_and_make_ego(layout):
         started.append(layout.name)
         return random(layout)
 
-    again = evaluate("random", make_recorded_ego, SIMPLE + RING, PUBLISHED, out=tmp_path, played=played.append)
+    again = evaluate("random", log_and_make_ego, SIMPLE + RING, PUBLISHED, out=tmp_path, played=played.append)
     assert returns_by_task(again) == batch_returns
     assert played == [5 * 4, 5, 5, 5, 5]  # stored tasks are reported in one call, other tasks after each episode
     assert started == ["coord_ring"]
@@ -201,4 +201,4 @@ def test_hidden_recipe_note_lists_layouts_that_hide_the_recipe():
 
 def test_headroom_is_stored_for_every_layout_and_family_of_test_tasks():
     for protocol in ("published", "seeded"):
-        assert set(read_headroom(protocol)) == {(task.layout.name, task.teammate_family) for task in ALL}
+        assert set(read_reference_returns(protocol)) == {(task.layout.name, task.teammate_family) for task in ALL}

@@ -73,7 +73,7 @@ def test_equal_observations_are_grouped_unless_hashes_collide(monkeypatch, colli
     grouped: Any = encoder.group_equal(encoder.WindowWords(jnp.asarray(ids, jnp.int32)))
     count = int(grouped.groups)
     assert count == (8 if collide else 4)
-    assert encoder.encoding_log(grouped)["distinct_observations"] == count / 8
+    assert encoder.encoding_metrics(grouped)["distinct_observations"] == count / 8
     assert sorted(set(grouped.group.ravel().tolist())) == list(range(count))
     np.testing.assert_array_equal(ids.reshape(8, 25)[grouped.first[grouped.group]], ids)
 

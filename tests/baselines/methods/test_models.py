@@ -58,7 +58,7 @@ class TestModelOptions:
 
 
 def dependence_masks(f, *inputs) -> list[np.ndarray]:
-    """Return a mask (O, T) for each input (T, ..): whether each output (O, ..) of f depends on each input row."""
+    """Return a mask of shape (O, T) for each input of T rows: whether the O outputs of `f` depend on the rows."""
     jacobians = jax.jit(jax.jacobian(f, argnums=tuple(range(len(inputs)))))(*inputs)
     return [
         np.abs(np.asarray(jacobian).reshape(len(jacobian), -1, len(x), x[0].size)).max(axis=(1, 3)) > 0
@@ -150,7 +150,7 @@ def test_several_dpt_queries_give_the_same_outputs_as_single_queries():
 
 
 def query_mask(context: int) -> np.ndarray:
-    """Return the mask of [c_1 .. c_K, q_0 .. q_K]: c_i attends to c_1 .. c_i; q_j attends to c_1 .. c_j and q_j."""
+    """Return the attention mask of c_1 .. c_K, q_0 .. q_K: c_i attends to c_1 .. c_i, and q_j to c_1 .. c_j and q_j."""
     to_context = np.concatenate([np.tri(context), np.tri(context + 1, context, -1)])
     to_queries = np.concatenate([np.zeros((context, context + 1)), np.eye(context + 1)])
     return np.concatenate([to_context, to_queries], axis=1).astype(bool)

@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.cells import FACINGS
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.overcooked.state import record_size, start_record
+from icrl4aht_data.overcooked.state import initial_record, record_size
 
 LAYOUT = get_layout("cramped_up")
 MIRRORINGS = list(product((False, True), repeat=2))
@@ -56,8 +56,8 @@ def test_mirrored_views_equal_views_on_the_mirrored_layout(rows, columns):
     positions = positions[positions[:, 0] != positions[:, 1]]
     facings = rng.integers(4, size=positions.shape).astype(np.uint8)
     recipe = rng.choice(LAYOUT.recipe_items, len(positions)).astype(np.uint8)
-    one = start_record(LAYOUT, positions, facings, recipe)
-    two = start_record(
+    one = initial_record(LAYOUT, positions, facings, recipe)
+    two = initial_record(
         other, mirrored_cells(LAYOUT, positions, rows, columns), mirrored_facings(facings, rows, columns), recipe
     )
     view, seen = view_change(rows, columns), 0
@@ -80,7 +80,7 @@ def test_hidden_recipe_indicator_looks_like_a_counter():
     positions = np.array([[both.agent_cells[0], both.agent_cells[1]]], np.uint8)
     facings, recipe = np.zeros((1, 2), np.uint8), both.recipe_items[:1]
     shown, without = (
-        jnp.asarray(observe(layout, start_record(layout, positions, facings, recipe), EGO, canonical=True))
+        jnp.asarray(observe(layout, initial_record(layout, positions, facings, recipe), EGO, canonical=True))
         for layout in (both, right)
     )
     assert not np.array_equal(shown, without)
@@ -95,7 +95,7 @@ def test_layout_numbers_of_a_batch_determine_how_views_are_changed():
     records = np.zeros((4, 2, size), np.uint8)
     for row, layout in enumerate((layouts[0], layouts[1], layouts[1], layouts[0])):
         positions = np.array([layout.agent_cells], np.uint8)
-        record = start_record(layout, positions, np.zeros((1, 2), np.uint8), layout.recipe_items[:1])
+        record = initial_record(layout, positions, np.zeros((1, 2), np.uint8), layout.recipe_items[:1])
         records[row, :, : record.shape[-1]] = record
     numbers = np.array([0, 1, 1 + 2 * 3, 0 + 2 * 1], np.int32)
     seen: Any = jax.jit(changed_view(layouts, hidden=["asymm_both"]))(jnp.asarray(records), numbers)

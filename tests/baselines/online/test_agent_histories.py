@@ -48,7 +48,7 @@ def dataset() -> Any:
 
 @pytest.fixture(scope="module")
 def teammates(dataset) -> Teammates:
-    """Return the teammates of `dataset`; invented returns make the oracle useless with the second teammate."""
+    """Return the teammates of `dataset`; with the second teammate, the oracle has an invented, very low return."""
     found = release_teammates(dataset)
     useless = ReferenceEgos(stay=0.0, random=0.0, oracle=-1000.0, episodes=100)
     return found._replace(references={found.tasks[1].task_id: useless})

@@ -11,7 +11,7 @@ import pytest
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.protocols import test_tasks as tasks_of
 from icrl4aht_baselines.online import adaptation, responses
-from icrl4aht_baselines.online.adaptation import HeadroomJob, adaptation_table, headroom_jobs, write_adaptation
+from icrl4aht_baselines.online.adaptation import AdaptationJob, adaptation_jobs, adaptation_table, write_adaptation
 from icrl4aht_baselines.online.responses import ResponseJob, ResponseOptions
 from icrl4aht_baselines.training import trainer
 from icrl4aht_generation.teammates.distances import common_records
@@ -83,7 +83,7 @@ def test_best_response_is_chosen_on_separate_episodes(tmp_path):
 
 def test_headroom_table_shows_mean_difference_and_interval(tmp_path):
     """Two seeds differ by 4 and 6: the mean is 5, and Student's interval with one degree of freedom is 5 +- 12.7."""
-    jobs = headroom_jobs({"demo_wide": DEMO[:2]}, 2, TINY, tmp_path)
+    jobs = adaptation_jobs({"demo_wide": DEMO[:2]}, 2, TINY, tmp_path)
     returns = {("informed", 0): 10.0, ("informed", 1): 11.0, ("episodic", 0): 6.0, ("episodic", 1): 5.0}
     for job in jobs:
         (tmp_path / job.name).mkdir()
@@ -96,7 +96,9 @@ def test_headroom_table_shows_mean_difference_and_interval(tmp_path):
     assert adaptation_table(tmp_path).splitlines()[-1] == row
     write_adaptation([job for job in jobs if job.seed == 0], tmp_path)
     assert "| 2 | 400 |" in adaptation_table(tmp_path), "a measurement with fewer seeds does not replace the stored one"
-    assert write_adaptation(headroom_jobs({"other": DEMO[2:3]}, 1, TINY, tmp_path), tmp_path).read_text().count("demo")
+    assert (
+        write_adaptation(adaptation_jobs({"other": DEMO[2:3]}, 1, TINY, tmp_path), tmp_path).read_text().count("demo")
+    )
 
 
 def test_headroom_table_in_the_docs_matches_stored_results():
@@ -106,7 +108,7 @@ def test_headroom_table_in_the_docs_matches_stored_results():
 
 def test_headroom_job_with_fewer_tasks_than_needed_raises_error(tmp_path):
     with pytest.raises(OptionError, match=r"tasks = 4: demo_wide has 20 tasks, .* give --tasks 20 or more"):
-        HeadroomJob(tuple(DEMO), 0, TINY, tmp_path, title="demo_wide", kind="informed")
+        AdaptationJob(tuple(DEMO), 0, TINY, tmp_path, title="demo_wide", kind="informed")
 
 
 @pytest.mark.slow
@@ -126,7 +128,7 @@ def test_tiny_best_response_and_headroom_jobs_finish(tmp_path, monkeypatch):
     job.run(lambda updates, speed: pytest.fail("a finished job was trained again"))
     assert (tmp_path / job.name / "result.json").read_bytes() == before
     tasks = {"all": [DEMO[5], *tasks_of("teammate", "test_wide", "H1")[:1]]}
-    for other in headroom_jobs(tasks, 1, TINY, tmp_path):
+    for other in adaptation_jobs(tasks, 1, TINY, tmp_path):
         other.run()
         assert set(other.result()["returns"]) == {task.task_id for task in tasks["all"]}
-    assert "| all |" in adaptation_table(write_adaptation(headroom_jobs(tasks, 1, TINY, tmp_path), tmp_path).parent)
+    assert "| all |" in adaptation_table(write_adaptation(adaptation_jobs(tasks, 1, TINY, tmp_path), tmp_path).parent)

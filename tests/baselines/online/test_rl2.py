@@ -43,7 +43,7 @@ from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.overcooked.state import start_record
+from icrl4aht_data.overcooked.state import initial_record
 from tests.helpers.commands import run_cli
 from tests.helpers.spoiled import read_lines
 
@@ -142,7 +142,7 @@ def test_training_log_has_losses_and_falling_imitation_weight(full_run):
 
 
 def test_imitation_loss_makes_the_actions_of_the_script_likelier(trainer, compiled_episodes):
-    """On fixed episodes, only a positive imitation weight makes the actions of the script likelier."""
+    """On fixed episodes, only a positive imitation weight makes the actions of the imitated script likelier."""
     state = trainer.init()
     _, played, _ = compiled_episodes(state.params, trainer.players[0].mates, state.tasks[0], jax.random.key(0))
     fallen = {}
@@ -249,7 +249,7 @@ class TestTaskGroups:
 def played_actions(mates: list[Policy]) -> list[np.ndarray]:
     """Return 40 actions of each teammate, all chosen in the start state of an episode."""
     cells, facings = np.array(LAYOUT.agent_cells, np.uint8), np.zeros(2, np.uint8)
-    record = jnp.asarray(start_record(LAYOUT, cells, facings, LAYOUT.recipe_items[0]))
+    record = jnp.asarray(initial_record(LAYOUT, cells, facings, LAYOUT.recipe_items[0]))
     act = jax.jit(mates[0].act)
     found = []
     for mate in mates:
@@ -262,7 +262,7 @@ def played_actions(mates: list[Policy]) -> list[np.ndarray]:
 
 
 class TestPreparation:
-    """Preparation of RL^2 training: teammates and layouts from histories, manifests and rearranged layouts."""
+    """Test which teammates and layouts RL^2 training uses, given histories, manifests and rearranged layouts."""
 
     MODEL = dataclasses.replace(ModelOptions(**RL2_SETTINGS["model"]), width=8)
     CHOICE = HistoryOptions(("cramped_up",), source=("noise",), hide_recipe=("cramped_up",))

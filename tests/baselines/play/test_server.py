@@ -94,7 +94,7 @@ def test_keys_move_the_agent_by_the_rules():
         assert player.frame["clock"] == 4
 
 
-def play_by_oracle(player: Browser, episodes: int, steps: int) -> None:
+def play_oracle_actions(player: Browser, episodes: int, steps: int) -> None:
     """Play episodes with the oracle's actions instead of a person's keys."""
     plan = PolicyPlayer(oracle(LAYOUT), LAYOUT, EGO, is_ego=True)
     key, before = task_key(0, "plan"), (None,) * 5
@@ -116,10 +116,10 @@ def test_recorded_game_is_a_valid_release(tmp_path):
         assert not (tmp_path / "record").exists()
         assert player.send(pseudonym="someone", agrees=True)["consent"] is None
         player.frame = player.socket.receive_json()
-        play_by_oracle(player, 1, 100)
+        play_oracle_actions(player, 1, 100)
         assert load_icrl4aht(tmp_path / "record")[0].entry.episodes == 1, "each episode is written when it ends"
         player.socket.send_json({"view": "whole"})
-        play_by_oracle(player, 1, 100)
+        play_oracle_actions(player, 1, 100)
         assert player.frame["over"] and max(player.frame["returns"]) >= 20
     report = verify_release(tmp_path / "record", level="deep")
     assert report.ok, report.findings

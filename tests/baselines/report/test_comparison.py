@@ -15,7 +15,7 @@ from icrl4aht_baselines.report.submission import AgentFacts, make_submission
 from msgspec import structs
 
 from icrl4aht_data.benchmark import best_responses
-from icrl4aht_data.benchmark.reference_returns import read_headroom
+from icrl4aht_data.benchmark.reference_returns import read_reference_returns
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.templates import card_file
 from tests.helpers.evaluated import write_results
@@ -97,7 +97,7 @@ def test_layouts_table_has_reference_egos_and_returns_by_layout(stored, invented
 
 
 def test_mean_best_return_uses_stay_for_families_without_best_response(invented_responses):
-    scales, stay = cell_scales("seeded"), read_headroom("seeded")
+    scales, stay = cell_scales("seeded"), read_reference_returns("seeded")
     ring = [cell for cell in scales if cell.layout == "coord_ring"]
     h2 = next(cell for cell in ring if cell.family == "H2")
     others = sum(stay[cell[:2]]["stay"] for cell in ring if cell != h2)

@@ -98,7 +98,7 @@ def test_score_scales_cover_all_tasks_with_a_best_response(invented_responses):
     )
     assert all(len(scale.tasks) == 5 for scale in scales.values())
     assert len({task.behaviour for task in scales[ResultCell("demo_wide", "H4")].tasks.values()}) == 1
-    assert {*scales[WIDE].tasks} == {task_label(task) for task in scores.bundled_cells()[WIDE]}
+    assert {*scales[WIDE].tasks} == {task_label(task) for task in scores.bundled_ids_by_cell()[WIDE]}
 
 
 def test_damaged_file_of_best_responses_raises_error(tmp_path):
@@ -108,7 +108,7 @@ def test_damaged_file_of_best_responses_raises_error(tmp_path):
     assert card.version == "7" and isinstance(card.behaviours[0], BestResponse)
     text = (tmp_path / "b.json").read_text()
     (tmp_path / "twice.json").write_text(text.replace('"behaviours": [', f'"behaviours": [{text.splitlines()[5]}', 1))
-    with pytest.raises(OptionError, match=r"twice\.json: expected one best response to task teammate_test_grounded_"):
+    with pytest.raises(OptionError, match=r"twice\.json: expected one best response for task teammate_test_grounded_"):
         read_best_responses(tmp_path / "twice.json")
     (tmp_path / "bad.json").write_text(text.replace('"best":', '"beast":'))
     with pytest.raises(OptionError, match=r"bad\.json: invalid file of best responses: .*restore it"):

@@ -9,11 +9,11 @@ import pytest
 from icrl4aht_baselines.report.statistics import (
     MeanInterval,
     Stratum,
-    holm,
+    holm_corrected,
     interquartile_mean,
     mean_interval,
-    mean_stratum,
     ratio_interval,
+    stratum_of_values,
 )
 from scipy.stats import ttest_1samp
 
@@ -61,9 +61,9 @@ def test_interquartile_mean_drops_a_quarter_of_values_at_each_end():
 
 
 def test_holm_corrects_p_values():
-    found = holm({"a": 0.01, "b": 0.04, "c": 0.03, "d": float("nan")})
+    found = holm_corrected({"a": 0.01, "b": 0.04, "c": 0.03, "d": float("nan")})
     assert [found[name] for name in "abc"] == pytest.approx([0.03, 0.06, 0.06]) and np.isnan(found["d"])
-    assert holm({}) == {}
+    assert holm_corrected({}) == {}
 
 
 @pytest.mark.slow
@@ -74,6 +74,6 @@ def test_intervals_have_the_nominal_coverage(trainings):
     for _ in range(rounds):
         common = rng.normal(0.0, 0.5, (trainings, 1)) if trainings > 1 else np.zeros((1, 1))
         cells = [common + rng.normal(cell, 1.0 + cell, 5) for cell in range(4)]
-        found = ratio_interval([[mean_stratum(cell)] for cell in cells], resamples=1000)
+        found = ratio_interval([[stratum_of_values(cell)] for cell in cells], resamples=1000)
         covered += found.low <= 1.5 <= found.high
     assert 0.92 < covered / rounds < 0.98

@@ -134,7 +134,7 @@ def test_loggers_of_a_resumed_run_store_each_line_exactly_once(tmp_path, name, o
         write_lines(loggers, LINES)
         raise KeyboardInterrupt
     assert READERS[name](run) == expected_values(LINES)
-    # The checkpoint of step 2 is after the first line.
+    # Resuming from a checkpoint of step 2 keeps only the first line.
     metrics.write_text("".join(json.dumps(line) + "\n" for line in LINES[:1]))
     more = [*LINES[1:], {"step": 6, "part": "train", "loss": 1.0}]
     with open_loggers([name, name], metrics, {"train": {"seed": 0}}) as loggers:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from icrl4aht_baselines.training.histories import training_cells
+from icrl4aht_baselines.training.histories import training_record
 from icrl4aht_baselines.training.seen import SeenInTraining, read_trained_on
 from icrl4aht_generation.teammates.instances import published_task
 
@@ -21,12 +21,12 @@ def dataset(two_sources) -> Dataset:
 
 def test_training_record_lists_all_teammates_of_each_family(dataset):
     found = {}
-    for cell in training_cells(dataset):
+    for cell in training_record(dataset):
         of_cell = dataset.filter(teammate_kind=cell["algorithm"])
         assert cell["teammates"] == teammate_ids(dataset, of_cell.ids.tolist())
         assert len(cell["teammates"]) == cell["tasks"]
         found[cell["algorithm"]] = tuple(cell["teammates"])
-    assert read_trained_on(training_cells(dataset), "run.json") == SeenInTraining(("demo_wide",), found)
+    assert read_trained_on(training_record(dataset), "run.json") == SeenInTraining(("demo_wide",), found)
 
 
 def test_teammate_id_depends_only_on_the_policy():

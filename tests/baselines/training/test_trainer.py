@@ -147,7 +147,7 @@ class TestStopping:
 
     def test_sigterm_saves_checkpoint_and_training_resumes_bit_for_bit(self, full_run, tmp_path):
         with pytest.raises(
-            TrainingStopped, match=r"stopped by SIGTERM after step 4 of 7.* the same command resumes it"
+            TrainingStopped, match=r"stopped by SIGTERM after step 4 of 7.* repeat the command to resume from the saved state"
         ) as stopped:
             train_tiny(tmp_path, done=terminate_at_4)
         assert stopped.value.code == 143
@@ -188,7 +188,7 @@ class TestStopping:
         assert decision((1, 2)) == (True, 2)
 
 
-class TestFolder:
+class TestRunFolder:
     def test_run_without_checkpoint_accepts_other_settings(self, full_run, tmp_path):
         """A run folder accepts other settings as long as it has no checkpoint."""
         first, corrected = ({**format_versions(), "train": {"batch_size": size}} for size in (10**9, 4))
@@ -207,7 +207,7 @@ class TestFolder:
             train_tiny(tmp_path / "notes.txt")
 
 
-class TestStep:
+class TestTrainingStep:
     @pytest.mark.slow
     def test_accumulated_gradient_equals_gradient_of_complete_batch(self):
         """The mean over two micro-batches with unequal padding is the gradient of the complete batch."""

@@ -98,7 +98,7 @@ def test_resumed_collection_repeats_updates_after_the_last_save(built, job):
     with (partial / METRICS).open("a") as stream:
         stream.write('{"update": 6, "half a li')
     rewards = np.load(partial / "rewards.npy", mmap_mode="r+")
-    rewards[:, 180:] = 77  # the saved state covers 180 steps, so the resumed run overwrites later values
+    rewards[:, 180:] = 77  # the saved state covers 180 recorded steps; the resumed run overwrites the rest
     rewards.flush()
     job.run()
     assert not compare_rebuilds(job.folder, artefact(built / "a")).differences

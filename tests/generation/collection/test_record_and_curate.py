@@ -80,7 +80,7 @@ def test_recorded_arrays_equal_those_of_a_loop_over_steps(length, updates):
 
 
 def rewards_with_returns(returns: list[list[int]]) -> np.ndarray:
-    """Return rewards int8 (N, T) of 5 or -5 that add up to the given episode returns."""
+    """Return rewards of 5, 0 or -5, int8 of shape (N, T), that add up to the given episode returns."""
     totals = np.array(returns)[..., None] // 5
     rewards = np.where(np.arange(100) < abs(totals), 5 * np.sign(totals), 0).astype(np.int8)
     assert rewards.sum(axis=-1).tolist() == returns
@@ -117,20 +117,24 @@ def test_streams_with_equal_scores_are_ordered_by_number():
     assert best_streams([low] * 100 + [high] * 100, 200) == [*range(100, 200), *range(100)]
 
 
-def improving(*improvements: int) -> np.ndarray:
-    """Return the episode returns (N, 10) of histories that start at 0 and improve by the given amounts."""
+def improving_returns(*improvements: int) -> np.ndarray:
+    """Return episode returns, of shape (N, 10), of N histories that start at 0 and improve by the given amounts."""
     return np.array([[0.0] * 5 + [float(improvement)] * 5 for improvement in improvements])
 
 
 @pytest.mark.parametrize(
     ("learners", "keep", "expected"),
     [
-        ([improving(10, 50, 30, 20), improving(15, 40, 25, 5)], 4, [[1, 2], [1, 2]]),
-        ([improving(10, 50, 30, 20), improving(15, 40, 25, 5)], 3, [[1, 2], [1]]),  # in round 2, 30 comes before 25
-        ([improving(10, 20), improving(90, 80, 70, 60)], 3, [[1], [0, 1]]),
-        ([improving(30, 20, 40, 50), improving(0, 5, 4, 0)], 8, [[3, 2, 0, 1], [1]]),
-        ([improving(0), improving(0)], 2, [[], []]),
-        ([improving(9), improving(7), improving(8)], 2, [[0], [], [0]]),
+        ([improving_returns(10, 50, 30, 20), improving_returns(15, 40, 25, 5)], 4, [[1, 2], [1, 2]]),
+        (
+            [improving_returns(10, 50, 30, 20), improving_returns(15, 40, 25, 5)],
+            3,
+            [[1, 2], [1]],
+        ),  # in round 2, 30 is chosen before 25
+        ([improving_returns(10, 20), improving_returns(90, 80, 70, 60)], 3, [[1], [0, 1]]),
+        ([improving_returns(30, 20, 40, 50), improving_returns(0, 5, 4, 0)], 8, [[3, 2, 0, 1], [1]]),
+        ([improving_returns(0), improving_returns(0)], 2, [[], []]),
+        ([improving_returns(9), improving_returns(7), improving_returns(8)], 2, [[0], [], [0]]),
     ],
 )
 def test_selected_streams_are_divided_among_learners(learners, keep, expected):
@@ -139,7 +143,7 @@ def test_selected_streams_are_divided_among_learners(learners, keep, expected):
 
 @pytest.fixture(scope="module")
 def labels_and_logits():
-    """Return labels of two histories of two episodes, and logits with memory reset at episodes, at steps, or never."""
+    """Return labels of two histories of two episodes, and logits with memory reset per episode, per step, or never."""
     widths = Widths(pointwise=(8,), spatial=(8,), dense=32, gru=16, head=16)
     network = ActorCritic(widths)
     rng = np.random.default_rng(3)
@@ -166,12 +170,12 @@ def labels_and_logits():
             rows.append(np.asarray(out[1][0]))
         return np.stack(rows, axis=1)
 
-    labels = [curate.relabel(LAYOUT, network, params, stream) for stream in states]
+    labels = [curate.greedy_labels(LAYOUT, network, params, stream) for stream in states]
     ways = {"episode": {0, 100}, "step": set(range(200)), "never": {0}}
     return labels, {name: logits_with_resets_at(starts) for name, starts in ways.items()}
 
 
-def test_labels_are_greedy_actions_with_the_memory_of_the_episode(labels_and_logits):
+def test_labels_are_greedy_actions_with_memory_reset_at_each_episode(labels_and_logits):
     labels, logits = labels_and_logits
     assert [(label.shape, label.dtype) for label in labels] == [((200,), np.int8)] * 2
     chosen = np.take_along_axis(logits["episode"], np.stack(labels)[..., None].astype(int), axis=-1)[..., 0]

@@ -29,7 +29,7 @@ from tests.helpers.tiny import PAIR, artefact, start_python
 
 @pytest.fixture(scope="module")
 def profile(tmp_path_factory) -> Path:
-    """Return a profile with two tasks; the first task and the file name are those of the fixture `built`."""
+    """Return the path of a profile with two tasks; its first task and its file name equal those of `built`."""
     path = tmp_path_factory.mktemp("pair") / "tiny.toml"
     path.write_text(PAIR)
     return path
@@ -90,8 +90,10 @@ def listening_addresses(process: psutil.Process) -> set[str]:
 
 @pytest.mark.slow
 def test_ray_workers_collect_bit_equal_tasks(profile, damaged_partial, built, tmp_path):
-    """A damaged task fails on Ray, and the other task equals the task collected in one process. After its
-    damaged files are removed, the task is collected. With Ray, processes listen only on loopback addresses."""
+    """Ray workers collect a task with the same results as one process, and fail on a task with damaged files.
+
+    Without the damaged files, the second task is collected too. All processes listen only on loopback addresses.
+    """
     command = ["-m", "icrl4aht_data", "generate", "--profile", str(profile), "--out", str(tmp_path)]
     addresses: set[str] = set()
     process = start_python(*command, "--executor", "ray", "--workers", "2", "--retries", "1")

@@ -18,7 +18,7 @@ from icrl4aht_generation.collection.scripted import scripted_bytes
 from icrl4aht_generation.collection.scripted_rollout import noise_schedules, play_scripted_histories
 from icrl4aht_generation.collection.task_folder import METADATA, TIMING, last_timing, partial_folder
 from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS
-from icrl4aht_generation.profiles import Profile, Work, load_profile
+from icrl4aht_generation.profiles import Profile, WorkUnit, load_profile
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.releases.check import compare_rebuilds
 from icrl4aht_generation.teammates.distances import act_on_records
@@ -38,7 +38,7 @@ from tests.helpers.tiny import NOISE
 PIECE = 16
 LAYOUT = get_layout("demo_wide")
 MATE = heuristic_teammate("utility_greedy", "default", 0)
-WORK = Work(make_task("teammate", "train", "demo_wide", MATE, 7), "noise")
+WORK = WorkUnit(make_task("teammate", "train", "demo_wide", MATE, 7), "noise")
 
 
 pytestmark = pytest.mark.usefixtures("small_batches")
@@ -188,7 +188,7 @@ def test_full_disk_leaves_no_files_of_a_scripted_task(profile, tmp_path):
 
 def search_histories(profile: Profile, folder: Path, dish: tuple[int, int, int]) -> dict[str, np.ndarray]:
     """Return histories of the scripted ego that searches for the wanted recipe; the teammate never acts."""
-    work = Work(make_task("preference", "train", "asymm_both_plain", WATCHER, 5, [dish]), "search")
+    work = WorkUnit(make_task("preference", "train", "asymm_both_plain", WATCHER, 5, [dish]), "search")
     job = CollectionJob(work, profile, folder)
     job.run()
     assert job.is_finished()
@@ -230,7 +230,7 @@ def test_scripted_histories_can_have_a_learned_teammate(profile, tmp_path):
     save_random_checkpoint(tmp_path / "suite/member", LAYOUT)
     theta = {"checkpoint": "member", "sha256": file_hash(tmp_path / "suite/member" / POLICY_WEIGHTS)}
     mate = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0, "theta": theta}
-    work = Work(make_task("teammate", "train", "demo_wide", mate, 3), "noise")
+    work = WorkUnit(make_task("teammate", "train", "demo_wide", mate, 3), "noise")
     job = CollectionJob(work, profile, tmp_path, tmp_path / "suite")
     job.run()
     states = np.load(job.folder / "state.npy").reshape(40, 100, -1)[[0, 25]].swapaxes(0, 1)

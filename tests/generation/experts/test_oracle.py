@@ -52,7 +52,7 @@ def h4_ego(layout: Layout) -> Policy:
 
 @cache
 def episodes(agent: str, layout: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return records uint8 (N, T, S), actions (N, T, 2) and rewards (N, T) of all episodes of a layout."""
+    """Return records, actions and rewards of a layout's N episodes, of shapes (N, T, S), (N, T, 2) and (N, T)."""
     tasks = [t for t in TASKS if t.layout.name == layout and t.teammate_family == FAMILY_ON[layout]]
     make = h4_ego if agent == "h4" else AGENTS[agent]
     played = list(play_tasks(make, tasks, SHORT))

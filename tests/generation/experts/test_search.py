@@ -27,7 +27,7 @@ jitted = cache(jax.jit)
 
 
 def believed_dish(advises: bool, memory: Mapping[str, Any], **fields: Any) -> int:
-    """Return the item byte of the dish that the scripted ego, with the given memory, believes in after a new state."""
+    """Return the dish, as an item byte, that an ego with the given memory believes to be wanted after a new state."""
     script = searcher(LAYOUT, advises)
     start: SearchMemory = script.init(script.params, jax.random.key(0))
     start = start._replace(**{name: jnp.asarray(value) for name, value in memory.items()})
@@ -39,7 +39,7 @@ def believed_dish(advises: bool, memory: Mapping[str, Any], **fields: Any) -> in
 
 
 def dish_mask(*dishes: int) -> np.ndarray:
-    """Return a mask of dishes, bool (10,)."""
+    """Return a mask of the given dishes among all dishes, bool of shape (10,)."""
     return np.isin(np.pad(DISHES, (0, 10 - len(DISHES))), dishes)
 
 

@@ -100,7 +100,7 @@ def test_jobs_in_local_processes_are_retried_and_reported(tmp_path):
 
 
 def test_quick_jobs_share_worker_processes(tmp_path):
-    """A job that is not quick gets a new process."""
+    """Quick jobs share at most two worker processes, and every other job gets a new process."""
     jobs = [FileJob(tmp_path, f"{number}") for number in range(5)]
     jobs += [FileJob(tmp_path, name, is_quick=False) for name in ("long", "longer")]
     run(jobs, tmp_path, workers=2)

@@ -88,7 +88,7 @@ def test_generated_layouts_have_allowed_fixtures_and_recipes(family, samples):
     assert len(shown) == 8, "with and without recipe indicators, buttons and the delivery indicator"
 
 
-def test_family_rooms_has_small_layouts_and_every_third_separates_the_agents(samples):
+def test_layouts_of_family_rooms_are_small_and_every_third_separates_the_agents(samples):
     published = published_rooms(False) | published_rooms(True)
     assert len(published) == 7  # some layouts, such as coord_simple and test_simple, have the same floor cells
     for layout in samples["rooms"]:

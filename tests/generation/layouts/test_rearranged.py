@@ -1,4 +1,4 @@
-"""Test the rearranged versions of layouts on which stored models were trained."""
+"""Test rearranged layouts, which must not change because stored models were trained on them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TRAINING = TRACKS["layout"]["train"]
 
 
 def facing_counts(layout):
-    """Return the number of fixtures by map letter and by the agents that can face them."""
+    """Return the number of map cells for each map letter and set of agents that can face the cell."""
     faced = [neighbours(room).ravel().tolist() for room in agent_rooms(layout)]
     return Counter(zip(*faced, "".join(layout.rows), strict=True))
 

@@ -63,7 +63,7 @@ def test_unsolvable_layout_raises_error_with_the_reason(rows, recipes, reason):
         (("W01PWWWW", "WA PW AX", "WPWP  BW", "WWWWWWWW"), False),  # only the cooking agent reaches one of the pots
     ],
 )
-def test_layouts_on_which_scripted_experts_can_deliver_need_no_handover(rows, easy):
+def test_needs_no_handover_tells_whether_scripted_experts_can_deliver(rows, easy):
     layout = make_layout(rows, MIXED)
     assert needs_no_handover(grid_of(layout), faced_cells(agent_rooms(layout)), MIXED) == easy
 

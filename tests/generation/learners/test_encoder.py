@@ -65,7 +65,7 @@ def test_compact_inputs_give_the_features_and_gradients_of_observations(kind):
 
 
 def test_only_entries_that_can_differ_from_0_have_nonzero_initial_weights():
-    """Entries that are always 0 on the encoder's layout start with weight 0, so they have no effect before training."""
+    """Observation entries that are always 0 on the encoder's layout start with weight 0, thus without effect."""
     obs, view = jnp.asarray(observe(LAYOUT, RECORDS, 0)), CompactView("mlp", (LAYOUT,))
     kernels = {}
     for name, module, seen in (
@@ -83,7 +83,7 @@ def test_only_entries_that_can_differ_from_0_have_nonzero_initial_weights():
 
 
 def test_view_of_both_agents_has_more_entries_than_view_of_the_ego():
-    """On demo_wide the agents are in separate rooms, so the teammate observes entries that the ego never observes."""
+    """On demo_wide the agents are in separate rooms, so some observation entries are nonzero only for the teammate."""
     ego, both = (CompactView("mlp", (LAYOUT,), agents) for agents in ((0,), (0, 1)))
     assert len(ego.entries) < len(both.entries)
     assert set(ego.entries) <= set(both.entries)

@@ -45,7 +45,7 @@ class PlainActorCritic(nn.Module):
         return hidden, logits, value[..., 0]
 
 
-def plain_names(params: Any, widths: Widths) -> dict[str, Any]:
+def plain_params(params: Any, widths: Widths) -> dict[str, Any]:
     """Return parameters or gradients under the parameter names of `PlainActorCritic`."""
     tree = jax.tree.map(np.asarray, params["params"])
     encoder, gru = tree["encoder"], tree["gru"]
@@ -109,7 +109,7 @@ def test_network_has_the_expected_number_of_parameters():
 
 def test_outputs_and_gradients_equal_those_of_the_reference_network(case):
     plain = PlainActorCritic(case.network.widths)
-    names = plain_names(case.params, case.network.widths)
+    names = plain_params(case.params, case.network.widths)
     weights = jax.random.normal(jax.random.key(4), (STEPS, ENVS, 7))
 
     def gradients_and_outputs(network):
@@ -127,7 +127,7 @@ def test_outputs_and_gradients_equal_those_of_the_reference_network(case):
     for found, expected in zip(outputs, plain_outputs, strict=True):
         assert found.shape == expected.shape
         assert_close(found, expected)
-    found = plain_names(gradient, case.network.widths)
+    found = plain_params(gradient, case.network.widths)
     assert jax.tree.structure(found) == jax.tree.structure(plain_gradient)
     for (path, expected), leaf in zip(jax.tree.leaves_with_path(plain_gradient), jax.tree.leaves(found), strict=True):
         assert_close(leaf, expected, jax.tree_util.keystr(path))
@@ -138,7 +138,7 @@ def test_initial_weights_have_the_published_scales(case):
     """Initial kernels are orthogonal with the published scales, and initial biases are zero."""
     init = jax.jit(case.network.init)
     params = init(jax.random.key(0), case.hidden, case.obs, case.reset)
-    tree = plain_names(params, case.network.widths)["params"]
+    tree = plain_params(params, case.network.widths)["params"]
     scales = {"pointwise_0": 2**0.5, "pointwise_1": 2**0.5, "spatial_0": 2**0.5, "spatial_1": 2**0.5}
     scales |= {"actor_hidden": 2.0, "actor": 0.01, "critic_hidden": 2.0, "critic": 1.0}
     for name, scale in scales.items():

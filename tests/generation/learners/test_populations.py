@@ -118,9 +118,10 @@ def test_critics_receive_the_partner_if_partners_vary():
 
 
 def paper_slot_weights(algorithm: Any, memory: Any) -> np.ndarray:
-    """Return the weight of each slot's return in the objective that the paper gives the slot's policy, float64 (2, N).
+    """Return the weights of the slots' returns in the paper's objectives, float64 of shape (2, N).
 
-    The expected return of a pair of policies is estimated by the mean over the slots in which the pair plays.
+    The return of a slot counts in the objective of the policy that plays the slot. The expected return of a pair of
+    policies is estimated by the mean over the slots in which the pair plays.
     """
     assignment = algorithm.assignment(16)
     k = getattr(algorithm, "members", 0)
@@ -131,7 +132,8 @@ def paper_slot_weights(algorithm: Any, memory: Any) -> np.ndarray:
         elif isinstance(algorithm, CoMeDi):
             quarter = env // 4
             alpha, beta = algorithm.cross_play_weight, algorithm.mixed_play_weight
-            mixed = beta / 2 / 4 if left == right else beta / 2 / 2  # J_MP: means over 4 self-play slots and 2 others
+            # The objective J_MP has half the mean over 4 self-play slots, and half the mean over 2 other slots.
+            mixed = beta / 2 / 4 if left == right else beta / 2 / 2
             both = {0: 1 / 8, 1: -alpha / 4, 2: 0, 3: mixed}[quarter]
             expected[:, env] = [both * (left == 0), both * (right == 0)]
         else:
@@ -184,8 +186,9 @@ def test_slot_weights_follow_the_equations_of_the_paper(algorithm, memory):
 
 
 def random_returns(k: int, rng: np.random.Generator, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean return of each pair, float32 (2k, 2k), NaN for unseen pairs, and a mask of seen pairs.
+    """Return random mean returns of pairs of policies and a mask of the seen pairs, both of shape (2k, 2k).
 
+    Returns are float32, and NaN for unseen pairs.
     Only pairs of a best response as the ego and a confederate as the teammate can be seen.
     """
     seen = np.zeros((2 * k, 2 * k), bool)

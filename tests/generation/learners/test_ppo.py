@@ -1,8 +1,8 @@
 """Test PPO: advantages, loss, replay of the recurrent state, schedules, and learning.
 
 All tests use one tiny learner. Its ego stands between two buttons, a pile and a pot, so it often presses a button
-(reward -5) or fills the pot (shaped reward 3). Roll-outs have 8 steps and episodes have 12, so
-one episode ends inside the second rollout, and one at the end of the third.
+(reward -5) or fills the pot (shaped reward 3). Rollouts have 8 steps and episodes have 12 steps, so the first episode
+ends inside the second rollout, and the second episode ends with the third rollout.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ def replay(learner: Learner, state: LearnerState, rollout: Rollout, reset: np.nd
     return np.take_along_axis(log_probs, np.asarray(own.action)[..., None], axis=-1)[..., 0], np.asarray(output[2])
 
 
-def test_training_sequences_replay_a_roll_out_across_episodes(learner, played):
+def test_training_sequences_give_the_log_probs_and_values_of_the_rollout(learner, played):
     """The second rollout starts inside an episode with a nonzero hidden state; the next episode starts at step 4."""
     state, rollout = played.before[1], played.rollouts[1]
     np.testing.assert_array_equal(rollout.reset.nonzero()[0], [4] * 4)
@@ -189,7 +189,7 @@ def test_training_sequences_replay_a_roll_out_across_episodes(learner, played):
 
 
 def test_ppo_loss_equals_formulas_in_numpy(learner, played):
-    """Compare the loss with NumPy formulas; with other parameters than the rollout's, ratios and values are clipped."""
+    """Compare the loss with NumPy formulas, for parameters other than the rollout's, which cause clipping."""
     rollout = played.rollouts[1]
     rng = np.random.default_rng(6)
     params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.1, played.before[1].params)
@@ -276,7 +276,7 @@ delivery with 0 and 1 press."""
 
 
 def rewarded_rollout() -> Rollout:
-    """Return a rollout of two environments with `REWARDS`; agent a has the shaped reward a + 1 in every step."""
+    """Return a rollout of two environments with `REWARDS`; shaped rewards are 1 for the ego and 2 for the teammate."""
     size = (len(REWARDS), 2)
     zeros, choices = jnp.zeros(size), jnp.zeros((len(REWARDS), 4))
     return Rollout(

@@ -45,8 +45,8 @@ NETWORK = ActorCritic(Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=
 class ScriptMemory(NamedTuple):
     """Memory of a scripted player with M slots."""
 
-    begun: jax.Array  # (M, S), state record at the start of the episode
-    steps: jax.Array  # (M,), number of steps in the episode
+    begun: jax.Array  # shape (M, S), state record at the start of the episode
+    steps: jax.Array  # shape (M,), number of steps in the episode
 
 
 def scripted_player(slots: np.ndarray) -> Player:
@@ -64,7 +64,7 @@ def scripted_player(slots: np.ndarray) -> Player:
 
 
 def expected_actions(record: np.ndarray) -> np.ndarray:
-    """Return the actions int (T, N, 2) of the scripted players in a rollout that starts with new episodes."""
+    """Return the scripted players' actions in a rollout that starts with new episodes, int of shape (T, N, 2)."""
     slot = np.arange(2 * ENVS).reshape(2, ENVS).T
     step = np.arange(len(record))
     begun = record[step - step % EPISODE].sum(axis=-1, dtype=np.int64)
@@ -107,7 +107,10 @@ def played_with_hook() -> JoinedRollouts:
 
 @pytest.fixture(scope="module")
 def params() -> Any:
-    """Return random parameters of three policies, leaves (3, ...), with action probabilities far from uniform."""
+    """Return random parameters of three policies, in leaves of shape (3, ...).
+
+    Action probabilities are far from uniform.
+    """
     shapes = jax.eval_shape(lambda key: NETWORK.untrained(key, LAYOUT.channels), jax.random.key(0))
     rng = np.random.default_rng(4)
     return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=(3, *leaf.shape)), jnp.float32) * 0.4, shapes)

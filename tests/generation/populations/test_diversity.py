@@ -46,7 +46,7 @@ POLICIES = [policy(0), policy(1, act_by_state), policy(0), policy(1)]
 
 @pytest.fixture(scope="module", autouse=True)
 def cache_all_programs() -> Iterator[None]:
-    """Cache all compiled programs, since these tests spend most time on compiling small programs."""
+    """Cache all compiled programs, since these tests spend most of their time on compiling small programs."""
     least = jax.config.jax_persistent_cache_min_compile_time_secs  # type: ignore[attr-defined]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     yield

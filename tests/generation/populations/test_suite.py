@@ -181,7 +181,7 @@ class StopTraining(Exception):
 
 @pytest.fixture
 def stopped_suite(tmp_path, monkeypatch) -> Path:
-    """Return a suite in which LBRDiv training stopped at its last update, after multipliers had changed."""
+    """Return a suite in which LBRDiv training stopped at its last update, after its multipliers had changed."""
 
     def stop(updates: int, speed: float) -> None:
         if updates == smoke_run("lbrdiv").updates:
@@ -248,7 +248,7 @@ def test_population_on_two_devices_learns_the_same_policies(tmp_path):
 
 
 def write_suite_with_returns(root: Path, returns: dict[tuple[int, int], float], algorithm: str = "fcp") -> Path:
-    """Write a suite with the given returns by (member, checkpoint); the weight files of all checkpoints differ."""
+    """Write a suite of checkpoints with different weights; `returns` has the return of each (member, checkpoint)."""
     folder = population_folder(root, algorithm)
     for (member, checkpoint), greedy in returns.items():
         params = {"params": {"x": np.array([member, checkpoint, ALGORITHMS.index(algorithm)], np.float32)}}

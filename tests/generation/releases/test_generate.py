@@ -30,7 +30,7 @@ from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import LABEL_EPISODES
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.manifest import write_manifest
-from icrl4aht_data.format.provenance import NearestTest
+from icrl4aht_data.format.provenance import NearestTestTeammate
 from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -59,7 +59,7 @@ def test_history_has_the_first_100_of_each_400_steps(built):
 def test_release_keeps_the_histories_with_the_highest_scores_in_order(built):
     rewards = np.load(artefact(built / "a") / "rewards.npy")
     returns = rewards.reshape(8, 5, 100).sum(axis=-1)
-    scores = 2 * returns.mean(axis=1) - returns.mean(axis=1)  # 2 * end - start, both means of five episodes
+    scores = 2 * returns.mean(axis=1) - returns.mean(axis=1)  # 2 * end - start; both are the mean of all five episodes
     kept = [entry.env_idx for entry in load_icrl4aht(built / "a" / "lite").entries]
     assert kept == np.argsort(-scores, kind="stable")[:3].tolist()
 
@@ -139,8 +139,8 @@ def quick_measurements():
         returns = [[float(number)] * LABEL_EPISODES for number, _ in enumerate(checkpoints)]
         return CheckpointReturns(returns, returns)
 
-    def fixed_nearest(layout, policies) -> list[NearestTest]:
-        return [NearestTest("H4/t0", 0.5, number) for number, _ in enumerate(policies)]
+    def fixed_nearest(layout, policies) -> list[NearestTestTeammate]:
+        return [NearestTestTeammate("H4/t0", 0.5, number) for number, _ in enumerate(policies)]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(labeller, "_measure", measure_unless_learned)

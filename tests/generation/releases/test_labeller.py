@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from icrl4aht_generation.collection.curate import relabel
+from icrl4aht_generation.collection.curate import greedy_labels
 from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, is_task_finished
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
-from icrl4aht_generation.profiles import Profile, Work, load_profile
+from icrl4aht_generation.profiles import Profile, WorkUnit, load_profile
 from icrl4aht_generation.releases import labeller
 from icrl4aht_generation.releases.labeller import CheckpointReturns, choose_checkpoint, choose_labeller
 from icrl4aht_generation.releases.measures import teammate_facts
@@ -40,7 +40,7 @@ from tests.helpers.tiny import artefact
 
 
 def returns_with_means(*means: float, spread: float = 0.0) -> np.ndarray:
-    """Return episode returns (C, E) of C checkpoints with the given means.
+    """Return episode returns, of shape (C, E), of C checkpoints with the given mean returns.
 
     `spread` is the standard deviation, over episodes, of the difference between two checkpoints' returns.
     """
@@ -90,7 +90,7 @@ def package_task(task: tuple[Task, Profile, Path], target: Path, kind: Kind = "l
     """Package the task into a release, with some settings of the profile changed."""
     chosen, profile, folder = task
     facts = teammate_facts([chosen], folder.parent, target)
-    return package_release(folder.parent, target, [Work(chosen)], replace(profile, **changes), target, kind, facts)
+    return package_release(folder.parent, target, [WorkUnit(chosen)], replace(profile, **changes), target, kind, facts)
 
 
 def fail_if_called(*arguments):
@@ -106,7 +106,7 @@ def test_packaging_measures_every_checkpoint_once(task, tmp_path, monkeypatch):
     assert len(np.unique(found["sampled"])) > 1
     monkeypatch.setattr(labeller, "_measure", fail_if_called)
     package_task(task, tmp_path / "full", "full")
-    assert is_task_finished(folder, Work(chosen), profile)
+    assert is_task_finished(folder, WorkUnit(chosen), profile)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_clearly_better_earlier_checkpoint_labels_the_histories(task, tmp_path):
     dataset = load_icrl4aht(root)
     network, params, card = load_policy(folder / "checkpoints/c1")
     for history in dataset:
-        labels = relabel(chosen.layout, network, params, history.state[:])
+        labels = greedy_labels(chosen.layout, network, params, history.state[:])
         np.testing.assert_array_equal(history.expert_actions[:], labels)
         assert (history.entry.expert_return, history.entry.expert_return_sampled) == (60, sampled)
         assert history.entry.expert_step == card["steps"] == 3_200 * 2

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from icrl4aht_generation.collection.curate import oracle_labels
 from icrl4aht_generation.collection.task_folder import HISTORY_ARRAYS, LABELLER_RETURNS, METADATA
-from icrl4aht_generation.profiles import Profile, Work, load_profile
+from icrl4aht_generation.profiles import Profile, WorkUnit, load_profile
 from icrl4aht_generation.releases import measures
 from icrl4aht_generation.releases.measures import TeammateFacts, teammate_facts, unusable_families
 from icrl4aht_generation.releases.package import package_release, recorded_sources
@@ -27,13 +27,13 @@ from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.provenance import NearestTest, ReferenceEgos, read_provenance
+from icrl4aht_data.format.provenance import NearestTestTeammate, ReferenceEgos, read_provenance
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from tests.helpers.commands import run_cli
 from tests.helpers.tiny import artefact
 
-MATTERS = TeammateFacts(ReferenceEgos(0.0, 1.0, 40.0, 20), NearestTest("H4/t0", 0.25, 3))
-DOES_NOT = TeammateFacts(ReferenceEgos(40.0, 39.0, 40.0, 20), NearestTest("H4/t0", 0.25, 3))
+MATTERS = TeammateFacts(ReferenceEgos(0.0, 1.0, 40.0, 20), NearestTestTeammate("H4/t0", 0.25, 3))
+DOES_NOT = TeammateFacts(ReferenceEgos(40.0, 39.0, 40.0, 20), NearestTestTeammate("H4/t0", 0.25, 3))
 
 
 @pytest.fixture
@@ -41,10 +41,10 @@ def profile(built) -> Profile:
     return replace(load_profile(str(built / "tiny.toml")), learners=2, keep=4)
 
 
-def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequence[float], greedy: float) -> None:
+def make_learner(built: Path, work: WorkUnit, artefacts: Path, improvements: Sequence[float], greedy: float) -> None:
     """Write the artefact of a learner with 8 histories of ten episodes; history k improves by `improvements[k]`.
 
-    Later histories do not improve. Every checkpoint has the measured greedy return `greedy`.
+    Histories beyond the end of `improvements` do not improve. Every checkpoint has the measured greedy return `greedy`.
     """
     folder = artefacts / work.name
     shutil.copytree(artefact(built / "a"), folder)
@@ -59,7 +59,7 @@ def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequenc
     (folder / LABELLER_RETURNS).write_text(json.dumps(measured))
 
 
-def make_noise_task(built: Path, work: Work, artefacts: Path) -> None:
+def make_noise_task(built: Path, work: WorkUnit, artefacts: Path) -> None:
     """Write the artefact of a task with two noise histories."""
     source, folder = artefact(built / "a"), artefacts / work.name
     folder.mkdir(parents=True)
@@ -80,15 +80,15 @@ def make_tasks(profile: Profile, count: int) -> list[Task]:
     return [first, *(make_task("teammate", "train", "demo_wide", entry, 7) for entry in entries[1:])]
 
 
-def package_tasks(tmp_path: Path, profile: Profile, works: Sequence[Work], facts: dict[str, TeammateFacts]) -> Path:
+def package_tasks(tmp_path: Path, profile: Profile, works: Sequence[WorkUnit], facts: dict[str, TeammateFacts]) -> Path:
     return package_release(tmp_path / "artefacts", tmp_path / "release", works, profile, tmp_path, "lite", facts)
 
 
 @pytest.fixture
-def two_learners(built, profile, tmp_path) -> list[Work]:
+def two_learners(built, profile, tmp_path) -> list[WorkUnit]:
     """Return two learners of one task: 3 histories of the first and 1 history of the second improve by 5 or more."""
     (task,) = make_tasks(profile, 1)
-    works = [Work(task, "ppo", learner) for learner in range(2)]
+    works = [WorkUnit(task, "ppo", learner) for learner in range(2)]
     make_learner(built, works[0], tmp_path / "artefacts", [10, 4, 20, 15], 5.0)
     make_learner(built, works[1], tmp_path / "artefacts", [3, 25], 7.0)
     return works
@@ -145,7 +145,7 @@ def test_minimum_improvement_is_not_required_without_headroom(two_learners, prof
 
 def test_tasks_without_improving_histories_or_headroom_are_left_out(built, two_learners, profile, tmp_path):
     flat = make_tasks(profile, 2)[1]
-    works = [*two_learners, *(Work(flat, "ppo", learner) for learner in range(2))]
+    works = [*two_learners, *(WorkUnit(flat, "ppo", learner) for learner in range(2))]
     for work in works[2:]:
         make_learner(built, work, tmp_path / "artefacts", [4, 4], 0.0)
     strict = replace(profile, least_improvement=5.0)
@@ -166,7 +166,7 @@ def test_tasks_without_improving_histories_or_headroom_are_left_out(built, two_l
 def test_tasks_with_little_mean_improvement_are_left_out(built, two_learners, profile, tmp_path):
     """The kept histories of the first task improve by 17.5 on average, and those of the second task by 5.5."""
     flat = make_tasks(profile, 2)[1]
-    make_learner(built, work := Work(flat, "ppo"), tmp_path / "artefacts", [4, 6, 3, 5], 5.0)
+    make_learner(built, work := WorkUnit(flat, "ppo"), tmp_path / "artefacts", [4, 6, 3, 5], 5.0)
     works, task_id = [*two_learners, work], two_learners[0].task.task_id
     rising = replace(profile, least_improvement=5.0, least_rise=17.0)
     root = package_tasks(tmp_path, rising, works, {task_id: MATTERS, flat.task_id: MATTERS})
@@ -182,7 +182,7 @@ def test_tasks_with_little_mean_improvement_are_left_out(built, two_learners, pr
 
 def test_noise_histories_are_labelled_by_their_scripted_ego(built, profile, tmp_path):
     (task,) = make_tasks(profile, 1)
-    work = Work(task, "noise")
+    work = WorkUnit(task, "noise")
     make_noise_task(built, work, tmp_path / "artefacts")
     both = replace(profile, sources=("noise",), oracle_actions=True, least_improvement=5.0)
     root = package_tasks(tmp_path, both, [work], {task.task_id: MATTERS})
@@ -234,7 +234,9 @@ def test_drawn_teammates_use_stored_measurements_and_other_teammates_are_measure
     monkeypatch.setattr(measures, "_measure", measure)
     for _ in range(2):  # the second call reads the stored file
         facts = teammate_facts([drawn, other], tmp_path, tmp_path)
-        assert facts[drawn.task_id] == TeammateFacts(ReferenceEgos(0.0, 1.0, 30.0, 20), NearestTest("H3/t1", 0.3, 1))
+        assert facts[drawn.task_id] == TeammateFacts(
+            ReferenceEgos(0.0, 1.0, 30.0, 20), NearestTestTeammate("H3/t1", 0.3, 1)
+        )
         assert facts[other.task_id] == DOES_NOT
     assert calls == [[other.task_id]]
 
@@ -249,7 +251,7 @@ def test_nearest_test_teammate_can_be_of_another_family(monkeypatch):
     tasks = [make_task("teammate", "train", "demo_wide", entry, 0) for entry in entries]
     facts = teammate_facts(tasks, Path("no artefacts"), Path("no suite"))
     nearest = [facts[task.task_id].nearest for task in tasks]
-    assert nearest == [NearestTest("H1/t0", 0.006, 0), NearestTest("H3/t1", 0.3, 0)]
+    assert nearest == [NearestTestTeammate("H1/t0", 0.006, 0), NearestTestTeammate("H3/t1", 0.3, 0)]
 
 
 def test_families_without_usable_draws_are_reported_with_the_reason(monkeypatch):

@@ -31,13 +31,13 @@ UNCACHED = draws._bundled_draws.__wrapped__
 
 
 def draw(family: str, theta_id: int, behaviour: int = 0, *, base_seed=0, distance=0.5, oracle=30.0) -> Draw:
-    """Return a measured teammate on demo_wide, with which the ego `stay` earns 1 and the ego `random` earns 2."""
+    """Return a measured teammate on demo_wide; the egos `stay` and `random` earn 1 and 2 with this teammate."""
     return Draw(
         "demo_wide", family, base_seed, theta_id, "H3/t0", distance, behaviour, 1.0, 2.0, oracle, "H1/t1", distance
     )
 
 
-def use_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *found: Draw) -> None:
+def replace_draws_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *found: Draw) -> None:
     write_table(tmp_path / "draws.jsonl", found)
     monkeypatch.setattr(draws, "DRAWS_TABLE", tmp_path / "draws.jsonl")
     monkeypatch.setattr(draws, "_bundled_draws", UNCACHED)
@@ -129,7 +129,7 @@ def test_diverse_teammates_differ_from_test_teammates_and_each_other(track):
 
 def test_draws_alternate_between_families_and_start_with_new_behaviours(monkeypatch, tmp_path):
     h1 = [draw(H1, 0), draw(H1, 1), draw(H1, 2, behaviour=4), draw(H1, 3, behaviour=4), draw(H1, 4, behaviour=2)]
-    use_table(monkeypatch, tmp_path, *h1, draw(H3, 5), draw(H3, 6))
+    replace_draws_table(monkeypatch, tmp_path, *h1, draw(H3, 5), draw(H3, 6))
     assert chosen_draws([H1], 5) == [(H1, 0), (H1, 2), (H1, 4), (H1, 1), (H1, 3)]
     assert chosen_draws([H3, H1], 6) == [(H3, 5), (H1, 0), (H3, 6), (H1, 2), (H1, 4), (H1, 1)]
     assert chosen_draws([H3, H1, H3], 2) == [(H3, 5), (H1, 0)]
@@ -137,7 +137,7 @@ def test_draws_alternate_between_families_and_start_with_new_behaviours(monkeypa
 
 
 def test_draws_with_more_headroom_come_first(monkeypatch, tmp_path):
-    """The lowest-numbered draw of each behaviour comes first, then all other draws, both sorted by headroom.
+    """The lowest-numbered draws of all behaviours come first, then all other draws; both groups are sorted by headroom.
 
     Draws that are similar to test teammates of other families come last.
     """
@@ -145,13 +145,15 @@ def test_draws_with_more_headroom_come_first(monkeypatch, tmp_path):
     others = [draw(H1, 3, oracle=25.0), draw(H1, 4, oracle=45.0), draw(H1, 5, behaviour=1, oracle=25.0)]
     like = replace(draw(H1, 6, behaviour=3, oracle=60.0), other="H4/t0", other_distance=0.0199)
     unlike = replace(draw(H1, 7, behaviour=3, oracle=10.0), other="H4/t0", other_distance=0.02)
-    use_table(monkeypatch, tmp_path, *first, *others, like, unlike)
+    replace_draws_table(monkeypatch, tmp_path, *first, *others, like, unlike)
     assert [found.spread for found in first] == [19.0, 49.0, 32.0]
     assert [theta_id for _, theta_id in chosen_draws([H1], 8)] == [1, 2, 0, 7, 4, 3, 5, 6]
 
 
 def test_draws_similar_to_a_test_teammate_are_left_out(monkeypatch, tmp_path):
-    use_table(monkeypatch, tmp_path, draw(H1, 0, distance=0.0199), draw(H1, 1, distance=0.02), draw(H2, 0, distance=0))
+    replace_draws_table(
+        monkeypatch, tmp_path, draw(H1, 0, distance=0.0199), draw(H1, 1, distance=0.02), draw(H2, 0, distance=0)
+    )
     assert usable_families("demo_wide") == [H1]
     assert chosen_draws([H1], 1) == [(H1, 1)]
     with pytest.raises(
@@ -162,11 +164,11 @@ def test_draws_similar_to_a_test_teammate_are_left_out(monkeypatch, tmp_path):
 
 def test_draws_without_headroom_are_left_out_if_other_draws_have_headroom(monkeypatch, tmp_path):
     flat, wide = draw(H1, 0, oracle=5.9), draw(H1, 1, oracle=6.0)
-    use_table(monkeypatch, tmp_path, flat, wide, draw(H3, 0, oracle=5.9))
+    replace_draws_table(monkeypatch, tmp_path, flat, wide, draw(H3, 0, oracle=5.9))
     assert chosen_draws([H1], 1) == [(H1, 1)]
     with pytest.raises(OptionError, match=f"of {H3}: none of the 1 draws .* differ by 4.9 .*differ by 5 or more"):
         drawn_teammates("demo_wide", [H3], 1)
-    use_table(monkeypatch, tmp_path, flat, replace(wide, distance=0.01), draw(H3, 0, oracle=5.9))
+    replace_draws_table(monkeypatch, tmp_path, flat, replace(wide, distance=0.01), draw(H3, 0, oracle=5.9))
     assert chosen_draws([H1, H3], 2) == [(H1, 0), (H3, 0)]
 
 

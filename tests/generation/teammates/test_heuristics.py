@@ -96,9 +96,10 @@ def start_records(name: str) -> np.ndarray:
 
 @cache
 def played(name: str, family: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return actions (100, 5, 129) and returns (5, 129) of a family's five published teammates as agent 1.
+    """Return actions and returns of a family's five published teammates as agent 1, in 129 episodes of 100 steps.
 
-    Noise is as published, and the ego always stays. The last episode has the published start and a constant recipe.
+    Actions have shape (100, 5, 129), and returns have shape (5, 129). Noise is as published, and the ego always stays.
+    The last episode has the published start and a constant recipe.
     """
     layout, records = LAYOUTS[name], start_records(name)
     entries = published_teammates(name, family)
@@ -169,8 +170,8 @@ ALL_SLOTS = tuple((family, slot) for family in HEURISTIC_FAMILIES for slot in (0
 def compiled_teammates() -> tuple[dict, Callable]:
     """Return the policies by (family, agent), and one compiled program that steps all policies on any layout.
 
-    The program maps parameters and memories (ROWS, ...), in the order of `ALL_SLOTS`, padded records (ROWS, S) and
-    padded tables to actions and memories.
+    The program takes lists of parameters and of memories in the order of `ALL_SLOTS`, with leaves of shape (ROWS, ...),
+    padded records of shape (ROWS, S), and padded tables. It returns a list of pairs of actions and memories.
     """
     policies = {slot: build_teammate(None, heuristic_teammate(slot[0], "default", 0), slot[1]) for slot in ALL_SLOTS}
 
@@ -285,7 +286,7 @@ INVADER = {"behavior_mode": territory.INVADER, "strictness": 1.0, "shared_margin
 TWO = {"pot_items": [2 * ZERO]}
 
 CRAMPED_CASES = [
-    # H1 walks around the partner, or keeps moving against the partner.
+    # H1 walks around a partner in its way, or keeps trying to move to the partner's cell.
     (H1, {}, {}, "1 32- 12- left, 1 32- 22- up, 0 21d 31- down, 0 210 22- right, 0 120 22- right, 0 32- 22- up"),
     (H1, {}, DONE, "0 21p 22- right, 1 21p 32d down"),
     # H1 as agent 1 leaves the pot to a partner that carries an ingredient and is about as near to the pot.
@@ -297,7 +298,8 @@ CRAMPED_CASES = [
     # Two H1 agents fetch different ingredients of a mixed recipe.
     (H1, {}, {"recipe": MIXED}, "1 22- 12- right, 0 22- 32- left"),
     (H1, {}, {"recipe": MIXED, "pot_items": [ZERO + ONE]}, "1 22- 32- left"),
-    # Depending on `yield_bias`, H2 waits for a partner near the only cell beside its target, or sidesteps it.
+    # `yield_bias` decides whether H2 waits as agent 1 if the partner is near the only access cell of the target, and
+    # whether H2 walks around the partner as agent 0.
     (H2, {"yield_bias": 0.1}, {}, "1 21- 12- stay, 1 21- 32- left"),
     (H2, {"yield_bias": 0.05}, {}, "1 21- 12- left, 1 32- 22- up"),
     (H2, {"yield_bias": 0.3}, {}, "0 32- 22- up"),
@@ -314,7 +316,7 @@ CRAMPED_CASES = [
     (H3, {}, {}, "1 32- 12- stay, 0 32- 12- left, 1 22- 31- left"),
     # H3 counts an ingredient in the partner's hand as if it were in the pot, but not a dish.
     (H3, {}, TWO, "0 22- 310 down, 0 22- 311 left, 0 22- 31d left"),
-    # H3 fetches a plate for a finished soup, and with high plate urgency also for a soup that cooks.
+    # H3 fetches a plate for a finished soup, and with high plate urgency also for a soup that is still cooking.
     (H3, {}, DONE, "0 21- 32- left"),
     (H3, {"plate_urgency": 0.6}, FULL, "0 21- 32- left"),
     (H3, {"plate_urgency": 0.5}, FULL, "0 21- 32- down"),
@@ -372,7 +374,7 @@ SURE = {"press_L_when_unknown": 1.0, "cost_sensitivity": 0.0}
 
 
 def split_key(key: jax.Array, n: int) -> list[int]:
-    """Return the data of a random key that was split n times, each time keeping the first of two new keys."""
+    """Split a random key n times, keep the first of the two new keys each time, and return the last key's data."""
     for _ in range(n):
         key = jax.random.split(key)[0]
     return jax.random.key_data(key).tolist()

@@ -41,7 +41,10 @@ def save_random_checkpoint(
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory) -> Path:
-    """Return a suite with checkpoints a, b, and (for test_simple) c; only the critic of a sees the partner."""
+    """Return a suite with checkpoints `a`, `b` and `c`.
+
+    Only the critic of `a` receives the partner. Checkpoint `c` is for the layout test_simple.
+    """
     root = tmp_path_factory.mktemp("suite")
     save_random_checkpoint(root / "a", partners=4)
     save_random_checkpoint(root / "b", seed=1)
@@ -50,12 +53,12 @@ def suite(tmp_path_factory) -> Path:
 
 
 def states(steps: int, seed: int) -> np.ndarray:
-    """Return random state records, uint8 (steps, ENVS, S)."""
+    """Return random state records, uint8 of shape (steps, ENVS, S)."""
     return random_records(LAYOUT, steps * ENVS, np.random.default_rng(seed)).reshape(steps, ENVS, -1)
 
 
 def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.ndarray:
-    """Return the logits (T, N, 6) of the whole actor-critic network on a sequence of states."""
+    """Return the logits of the whole actor-critic network on a sequence of states, of shape (T, N, 6)."""
     obs = observe(LAYOUT, record, slot)
     network = ActorCritic(WIDTHS, partners)
     reset = np.arange(len(record))[:, None] == np.zeros(ENVS)
@@ -65,7 +68,7 @@ def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.n
 
 
 def played_actions(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
-    """Return actions (T, N) that a policy takes step by step in N environments with the given states."""
+    """Return the actions, of shape (T, N), that a policy takes step by step in N environments with the given states."""
     player = policy_player(Environment(LAYOUT), policy, policy.params, slot, ENVS)
     act = jax.jit(player.act)
     zero = jnp.zeros(ENVS, jnp.int32)

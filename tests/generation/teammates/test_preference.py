@@ -21,7 +21,10 @@ def split_tasks() -> dict[str, list[Task]]:
 
 
 def test_preference_splits_share_no_teammates_and_hold_out_layouts_and_recipes(split_tasks):
-    """Training tasks have no test teammate and 7 of 10 or all 4 recipes; half of the test tasks are on new layouts."""
+    """Training tasks have no test teammate, and half of the test tasks are on new layouts.
+
+    Training tasks use all recipes of layouts with 4 recipes, and 7 recipes of layouts with 10 recipes.
+    """
     layouts = {split: {task.layout_name for task in tasks} for split, tasks in split_tasks.items()}
     assert layouts["train"] == layouts["validation"] == set(PREFERENCE_LAYOUTS["train"])
     halves = Counter(task.layout_name in layouts["train"] for task in split_tasks["test"])

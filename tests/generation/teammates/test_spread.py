@@ -1,4 +1,4 @@
-"""Test the choice and the shipped list of teammates whose actions differ widely, and the share of random actions."""
+"""Test the choice and the shipped list of teammates whose actions differ widely, and teammates with random actions."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_listed_teammates_differ_by_at_least_the_minimum_distance(layout):
 
 @pytest.mark.slow
 def test_measured_spread_teammates_match_the_list():
-    """Two teammates of one family are measured, so that only this family and the test teammates are compiled."""
+    """The test measures two teammates of one family, to compile only this family and the test teammates."""
     layout = get_layout("cramped_up")
     spread = read_spread(layout.name)
     family = "assembly_line"

@@ -18,9 +18,9 @@ from icrl4aht_data.browsing.page import (
     NO_ACTION,
     PAGE_START,
     embed_history,
+    evenly_spaced_episodes,
     make_browser_page,
-    spread_episodes,
-    spread_histories,
+    varied_history_ids,
 )
 from icrl4aht_data.errors import NotStoredError, OptionError, ReleaseError, UnknownNameError
 from icrl4aht_data.format.layouts_file import layout_title
@@ -91,7 +91,7 @@ def test_page_omits_label_columns_of_histories_without_labels(tmp_path):
 @pytest.mark.slow
 def test_page_of_thirty_bundled_histories_is_below_five_megabytes():
     bundled = load_icrl4aht()
-    chosen = bundled.select(spread_histories(bundled, 30))
+    chosen = bundled.select(varied_history_ids(bundled, 30))
     assert len(chosen) == 30
     shown, known = ({layout_title(one.name) for one in part.layouts} for part in (chosen, bundled))
     assert shown == known
@@ -117,12 +117,12 @@ def test_page_above_the_size_limit_shows_fewer_episodes(release):
 @settings(deadline=None)
 @given(st.integers(1, 5000), st.integers(1, 400))
 def test_spread_episodes_returns_evenly_spaced_episodes(number, most):
-    chosen = spread_episodes(number, most)
+    chosen = evenly_spaced_episodes(number, most)
     assert {0, number - 1} <= set(chosen.tolist())
     assert len(chosen) == min(number, max(2, most))
     gaps = np.diff(chosen)
     assert number == 1 or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
-    assert spread_episodes(number, None).tolist() == list(range(number))
+    assert evenly_spaced_episodes(number, None).tolist() == list(range(number))
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)

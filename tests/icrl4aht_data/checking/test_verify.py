@@ -22,7 +22,7 @@ from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from icrl4aht_data.writing import release
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from icrl4aht_data.writing.shard_writer import metadata_lines
+from icrl4aht_data.writing.shard_writer import metadata_rows
 from tests.helpers.commands import run_cli
 from tests.helpers.damages import flip_bit
 from tests.helpers.random_releases import SHARD, make_tasks, one_history_release, random_history, random_release
@@ -244,7 +244,7 @@ def update_metadata_rows(root):
     path = root / chunk_table_name(SHARD)
     table = np.load(path)
     chunks = table[table["rows"] > 0]
-    np.save(path, np.concatenate([chunks, metadata_lines((root / SHARD).read_bytes(), chunks)]))
+    np.save(path, np.concatenate([chunks, metadata_rows((root / SHARD).read_bytes(), chunks)]))
     write_manifest(root)
 
 

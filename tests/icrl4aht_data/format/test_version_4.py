@@ -180,7 +180,7 @@ def test_conversions_keep_left_out_tasks(lite_release, tmp_path):
     root = set_left_out(shutil.copytree(lite_release, tmp_path / "a"), LEFT_OUT, other)
     assert verify_release(root, level="deep").ok
     assert load_icrl4aht(root).info.left_out == [LEFT_OUT, other]
-    to_release(load_icrl4aht(root), tmp_path / "out", "full")  # the copy lists no left-out tasks on other layouts
+    to_release(load_icrl4aht(root), tmp_path / "out", "full")  # the copy only lists tasks on its own layout
     assert read_info(tmp_path / "out").left_out == [other]
     random_release(tmp_path / "b", layouts=("demo_wide",), teammates=1, streams=1)
     made = load_icrl4aht(tmp_path / "b").entries[0].task_id

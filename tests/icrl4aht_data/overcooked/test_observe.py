@@ -22,7 +22,7 @@ from icrl4aht_data.overcooked.actions import INTERACT, STAY
 from icrl4aht_data.overcooked.channels import channel_names
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe, observe_both
-from icrl4aht_data.overcooked.state import columns, faults, pack, record_size, start_record, unpack
+from icrl4aht_data.overcooked.state import columns, faults, initial_record, pack, record_size, unpack
 from tests.helpers.states import random_records, state_record
 
 CRAMPED, RING, SIMPLE, WIDE = (LAYOUTS[name] for name in ("cramped_up", "coord_ring", "test_simple", "test_wide"))
@@ -196,7 +196,7 @@ def test_unpack_then_pack_returns_the_same_records(layout):
 
 def test_start_state_has_empty_hands_pots_and_counters():
     positions, facings = np.array([[10, 13]], np.uint8), np.array([[3, 2]], np.uint8)
-    record = start_record(RING, positions, facings, np.array([RECIPE_111], np.uint8))
+    record = initial_record(RING, positions, facings, np.array([RECIPE_111], np.uint8))
     np.testing.assert_array_equal(record[0, :7], [10, 13, 3, 2, 0, 0, RECIPE_111])
     assert record.shape == (1, record_size(RING))
     assert not record[:, 7:].any()

@@ -185,14 +185,14 @@ def test_button_press_costs_5_and_shows_the_recipe_for_9_observations(slot):
     assert visible == [3] * 9 + [0, 0]
 
 
-# Tests of the order of agents: both agents face the pot (4, 2) of asymm_both
+# Tests of the order in which agents interact: both agents face the pot at (4, 2) of asymm_both
 
 
 @pytest.mark.parametrize(
     ("hands", "pot", "hands_after", "pot_after"),
     [
         ([ZERO, ONE], ZERO, [0, 0], (RECIPE_001, 19)),  # the teammate adds the third ingredient
-        ([ZERO, ONE], 2 * ZERO, [0, ONE], (RECIPE_000, 19)),  # the teammate's ingredient would be the fourth
+        ([ZERO, ONE], 2 * ZERO, [0, ONE], (RECIPE_000, 19)),  # the pot is full when the teammate interacts
         ([PLATE, PLATE], SOUP_000, [DISH_000, PLATE], (0, 0)),
         # the ego empties the pot, then the teammate adds an ingredient
         ([PLATE, ONE], SOUP_000, [DISH_000, 0], (ONE, 0)),

@@ -21,7 +21,7 @@ each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 
 
 def example_records(layout: Layout) -> np.ndarray:
-    """Return records, uint8 (800, S): half from random play, half drawn from all valid states."""
+    """Return state records of shape (800, S), uint8: half from random play, half drawn from all valid states."""
     rng = np.random.default_rng(5)
     return np.concatenate([random_history(layout, 4, 100, rng)["state"], random_records(layout, 400, rng)])
 

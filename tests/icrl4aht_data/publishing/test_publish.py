@@ -28,7 +28,7 @@ DAY = datetime.date(2026, 1, 2)
 
 @pytest.fixture(scope="session")
 def release(tmp_path_factory) -> Path:
-    """Return a full release of random play with both tracks and splits (read-only)."""
+    """Return a full release of random play with both tracks and the splits train and test (read-only)."""
     root = tmp_path_factory.mktemp("source") / "release"
     random_release(root, "full", ("coord_simple", "cramped_up", "cramped_down"), streams=2)
     return root

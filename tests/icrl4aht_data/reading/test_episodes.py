@@ -24,7 +24,7 @@ def dataset(lite) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def both_sources(two_sources) -> Dataset:
+def two_source_dataset(two_sources) -> Dataset:
     return load_icrl4aht(two_sources[0])
 
 
@@ -99,33 +99,37 @@ class TestAnimations:
 
 class TestSplit:
     @pytest.mark.parametrize("by", ["teammate", "history"])
-    def test_split_parts_are_disjoint_and_independent_of_order(self, both_sources, by):
-        train, validation = both_sources.split(0.25, seed=3, by=by)
-        assert sorted([*train.ids, *validation.ids]) == sorted(both_sources.ids)
-        shuffled = both_sources.select(np.random.default_rng(0).permutation(both_sources.ids))
+    def test_split_parts_are_disjoint_and_independent_of_order(self, two_source_dataset, by):
+        train, validation = two_source_dataset.split(0.25, seed=3, by=by)
+        assert sorted([*train.ids, *validation.ids]) == sorted(two_source_dataset.ids)
+        shuffled = two_source_dataset.select(np.random.default_rng(0).permutation(two_source_dataset.ids))
         assert set(shuffled.split(0.25, seed=3, by=by)[1].ids) == set(validation.ids)
-        others = {tuple(both_sources.split(0.25, seed=seed, by=by)[1].ids) for seed in range(5)}
+        others = {tuple(two_source_dataset.split(0.25, seed=seed, by=by)[1].ids) for seed in range(5)}
         assert len(others) > 1
 
-    def test_split_by_teammate_has_no_shared_teammates(self, both_sources):
-        train, validation = (set(part.column("task_id")) for part in both_sources.split(0.3))
+    def test_split_by_teammate_has_no_shared_teammates(self, two_source_dataset):
+        train, validation = (set(part.column("task_id")) for part in two_source_dataset.split(0.3))
         assert train and validation and not train & validation
 
-    def test_split_by_history_keeps_every_task_in_training(self, both_sources):
-        train, validation = both_sources.split(0.9, by="history")
-        assert set(validation.column("task_id")) <= set(train.column("task_id")) == set(both_sources.column("task_id"))
+    def test_split_by_history_keeps_every_task_in_training(self, two_source_dataset):
+        train, validation = two_source_dataset.split(0.9, by="history")
+        assert (
+            set(validation.column("task_id"))
+            <= set(train.column("task_id"))
+            == set(two_source_dataset.column("task_id"))
+        )
 
-    def test_invalid_splits_raise_errors(self, both_sources):
-        one = both_sources.filter(task_id=str(both_sources.column("task_id")[0]))
+    def test_invalid_splits_raise_errors(self, two_source_dataset):
+        one = two_source_dataset.filter(task_id=str(two_source_dataset.column("task_id")[0]))
         with pytest.raises(OptionError, match=r'has one teammate, so none can be held out; use by="history"'):
             one.split()
         with pytest.raises(OptionError, match=r"every task of .* has one history"):
             one[:1].split(by="history")
         for share in (0, 1, 1.5, True, "a"):
             with pytest.raises(OptionError, match=rf"validation = {share!r}: expected "):
-                both_sources.split(share)
+                two_source_dataset.split(share)
         with pytest.raises(UnknownNameError, match=r"unknown split by 'task'; valid: teammate, history"):
-            both_sources.split(by="task")  # type: ignore[arg-type]
+            two_source_dataset.split(by="task")  # type: ignore[arg-type]
 
 
 class TestSampleEpisodes:
@@ -155,51 +159,53 @@ class TestSampleEpisodes:
 
 
 class TestSort:
-    def test_sort_orders_histories_by_numbers_and_names(self, both_sources):
-        ordered = both_sources.sort("return_end")
+    def test_sort_orders_histories_by_numbers_and_names(self, two_source_dataset):
+        ordered = two_source_dataset.sort("return_end")
         assert (np.diff(ordered.column("return_end")) >= 0).all()
-        assert (np.diff(both_sources.sort("return_end", reverse=True).column("return_end")) <= 0).all()
-        by_both = both_sources[::-1].sort("layout", "history_id")
-        pairs = sorted(zip(both_sources.column("layout"), both_sources.ids.tolist(), strict=True))
+        assert (np.diff(two_source_dataset.sort("return_end", reverse=True).column("return_end")) <= 0).all()
+        by_both = two_source_dataset[::-1].sort("layout", "history_id")
+        pairs = sorted(zip(two_source_dataset.column("layout"), two_source_dataset.ids.tolist(), strict=True))
         assert by_both.ids.tolist() == [row for _, row in pairs]
-        assert len(by_both.sort("obs_shape")) == len(both_sources)
+        assert len(by_both.sort("obs_shape")) == len(two_source_dataset)
 
-    def test_sort_keeps_the_order_of_equal_histories(self, both_sources):
+    def test_sort_keeps_the_order_of_equal_histories(self, two_source_dataset):
         for reverse in (False, True):
-            assert both_sources.sort("action_dim", reverse=reverse).ids.tolist() == both_sources.ids.tolist()
+            assert (
+                two_source_dataset.sort("action_dim", reverse=reverse).ids.tolist() == two_source_dataset.ids.tolist()
+            )
 
-    def test_sort_puts_unknown_values_last(self, both_sources):
-        known = np.count_nonzero(both_sources.column("expert_step") != -1)
-        assert known < len(both_sources)
+    def test_sort_puts_unknown_values_last(self, two_source_dataset):
+        known = np.count_nonzero(two_source_dataset.column("expert_step") != -1)
+        assert known < len(two_source_dataset)
         for reverse in (False, True):
-            assert (both_sources.sort("expert_step", reverse=reverse).column("expert_step")[known:] == -1).all()
+            assert (two_source_dataset.sort("expert_step", reverse=reverse).column("expert_step")[known:] == -1).all()
 
-    def test_sort_refuses_invalid_column_names(self, both_sources):
+    def test_sort_refuses_invalid_column_names(self, two_source_dataset):
         with pytest.raises(UnknownNameError, match="unknown column 'return'"):
-            both_sources.sort("return")
+            two_source_dataset.sort("return")
         wrong_names: list[Any] = [(), (["layout", "return_end"],), (lambda entry: entry.T,)]
         for wrong in wrong_names:
             with pytest.raises(OptionError, match=r'index fields, such as ds.sort\("layout", "return_end"\)'):
-                both_sources.sort(*wrong)
+                two_source_dataset.sort(*wrong)
 
 
 class TestFilterFunctions:
-    def test_filter_function_selects_histories(self, both_sources):
-        found = both_sources.filter(lambda entry: entry.env_idx > 0, source="noise", split="train")
-        whole = both_sources.filter(source="noise", split="train")
+    def test_filter_function_selects_histories(self, two_source_dataset):
+        found = two_source_dataset.filter(lambda entry: entry.env_idx > 0, source="noise", split="train")
+        whole = two_source_dataset.filter(source="noise", split="train")
         assert found.ids.tolist() == whole.ids[whole.column("env_idx") > 0].tolist()
         assert 0 < len(found) < len(whole)
 
-    def test_filter_refuses_empty_results_and_non_functions(self, both_sources):
+    def test_filter_refuses_empty_results_and_non_functions(self, two_source_dataset):
         with pytest.raises(EmptySelectionError, match="no history of this selection passes the function"):
-            both_sources.filter(lambda entry: False)
+            two_source_dataset.filter(lambda entry: False)
         with pytest.raises(OptionError, match=r"filter: expected a function .*found 'demo_wide'"):
-            both_sources.filter("demo_wide")
+            two_source_dataset.filter("demo_wide")
 
-    def test_faulty_filter_functions_raise_errors(self, both_sources):
+    def test_faulty_filter_functions_raise_errors(self, two_source_dataset):
         with pytest.raises(AttributeError, match=r"property .*of 'History' object has no setter"):
-            both_sources[0].actions = both_sources[1].actions
+            two_source_dataset[0].actions = two_source_dataset[1].actions
         with pytest.raises(AttributeError, match="layuot"):
-            both_sources.filter(lambda entry: entry.layuot == "demo_wide")
+            two_source_dataset.filter(lambda entry: entry.layuot == "demo_wide")
         with pytest.raises(OptionError, match=r"expected the function to return True or False, found str"):
-            both_sources.filter(lambda entry: entry.layout)
+            two_source_dataset.filter(lambda entry: entry.layout)

@@ -130,7 +130,7 @@ class TestFaultyFiles:
                 replace_dataset("/0/actions", np.array([b"x"] * 120)),
                 r"group /0: actions: .*expected numbers or small arrays of numbers, found \|S1",
             ),
-            # Both layouts have the same number of channels, so conversion cannot find this fault.
+            # demo_simple has as many channels as coord_simple, so only deep verification finds the wrong layout name.
             (edit_index_line(2, layout="demo_simple"), None),
             (
                 edit_index_line(2, split="test", layout="demo_wide"),

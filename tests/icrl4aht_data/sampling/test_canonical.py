@@ -53,14 +53,14 @@ def test_canonical_histories_have_stored_channels_and_zeros_elsewhere(root):
 def ad_and_dpt_samplers(dataset):
     return [
         dataset.ad(batch_size=8, length=50, seed=3),
-        dataset.ad(batch_size=6, length=130, seed=3),  # these windows are longer than the histories
+        dataset.ad(batch_size=6, length=130, seed=3),  # windows longer than the histories of 120 steps
         dataset.dpt(batch_size=8, context=17, seed=3),
         dataset.dpt(batch_size=8, context=17, seed=3, order="random"),
     ]
 
 
 def render_canonical(records, layouts):
-    """Return canonical observations of state records uint8 (B, ..., S); `layouts` are indices into `LAYOUTS`, (B,)."""
+    """Return canonical observations of state records of shape (B, ..., S); `records[i]` is on `LAYOUTS[layouts[i]]`."""
     views = []
     for row, number in zip(records, layouts, strict=True):
         layout = get_layout(LAYOUTS[number])

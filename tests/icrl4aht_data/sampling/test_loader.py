@@ -21,8 +21,8 @@ LAYOUTS = ("coord_simple", "demo_simple", "coord_ring")
 
 
 @pytest.fixture(scope="module")
-def three_layouts(tmp_path_factory):
-    """Return a folder with two releases of the same histories on three layouts, one without states; also the arrays."""
+def three_layout_releases(tmp_path_factory):
+    """Return a folder with a release on three layouts and a copy without states, and the arrays of all histories."""
     root = tmp_path_factory.mktemp("three")
     written = random_release(root / "states", layouts=LAYOUTS, teammates=1)
     to_release(load_icrl4aht(root / "states"), root / "observations", "observations")
@@ -74,8 +74,8 @@ class TestCaches:
 
 @pytest.mark.parametrize("cache", CACHES)
 class TestSeveralLayouts:
-    def test_windows_of_several_layouts_equal_the_histories(self, three_layouts, cache):
-        root, written = three_layouts
+    def test_windows_of_several_layouts_equal_the_histories(self, three_layout_releases, cache):
+        root, written = three_layout_releases
         shown, states = (
             load_icrl4aht(root / "states", obs=obs, cache=cache).ad(batch_size=32, length=130)
             for obs in ("uint8", "state")
@@ -95,8 +95,10 @@ class TestSeveralLayouts:
             assert not batch.obs[row, 120:].any()
 
     @pytest.mark.parametrize("obs", ["float32", "uint8"])
-    def test_releases_with_and_without_states_give_equal_batches(self, three_layouts, cache, obs):
-        one, two = (load_icrl4aht(three_layouts[0] / name, obs=obs, cache=cache) for name in ("states", "observations"))
+    def test_releases_with_and_without_states_give_equal_batches(self, three_layout_releases, cache, obs):
+        one, two = (
+            load_icrl4aht(three_layout_releases[0] / name, obs=obs, cache=cache) for name in ("states", "observations")
+        )
         assert_equal_batches(one.ad(batch_size=16, length=130)[0], two.ad(batch_size=16, length=130)[0])
         batch = two.dpt(batch_size=16, context=30)[0]
         assert batch.layouts is None

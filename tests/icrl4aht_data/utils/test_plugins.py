@@ -10,7 +10,7 @@ from icrl4aht_baselines.methods.registry import all_methods, get_method, overcoo
 from icrl4aht_generation.teammates.registry import heuristic_teammate
 
 from icrl4aht_data import get_layout, load_icrl4aht, verify_release
-from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, layout_number, track_of
+from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, layout_number, layout_track
 from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.commands import doctor
 from icrl4aht_data.errors import OptionError, PluginError, UnknownNameError
@@ -83,9 +83,9 @@ def test_registered_layout_can_be_used_by_name(plugin_folder, tmp_path):
 
 
 def test_plugins_do_not_change_the_benchmark(plugin_folder):
-    before = CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES]
+    before = CANONICAL_CHANNELS, tuple(LAYOUTS), [layout_track(name) for name in LAYOUT_NAMES]
     with installed_plugins(plugin_folder):
-        assert before == (CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES])
+        assert before == (CANONICAL_CHANNELS, tuple(LAYOUTS), [layout_track(name) for name in LAYOUT_NAMES])
         assert [layout_number(name) for name in LAYOUT_NAMES] == list(range(10))
         assert 10 <= layout_number("plain_room") == layout_number("plain_room") < 20_000
 

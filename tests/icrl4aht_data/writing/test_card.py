@@ -15,7 +15,7 @@ from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import LeftOutTask, make_info
-from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos
+from icrl4aht_data.format.provenance import ExpertLabels, NearestTestTeammate, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, FORMAT_VERSION, HISTORIES, INFO, PROVENANCE, TASKS
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.utils.files import write_json
@@ -40,7 +40,7 @@ def make_provenance(
         source=source,
         learners=2 if source == "ppo" else None,
         references=ReferenceEgos(0.0, 1.5, oracle, 20),
-        nearest_test=NearestTest(nearest, distance, behaviour),
+        nearest_test=NearestTestTeammate(nearest, distance, behaviour),
         expert=expert,
     )
 
@@ -57,7 +57,7 @@ def four_tasks() -> Tasks:
 
 @pytest.fixture
 def write_meta(lite, tmp_path) -> Callable[..., dict[str, Any]]:
-    """Return a function that writes the folder meta/, with provenances edited by `change`, and returns card values."""
+    """Return a function that writes the folder meta/ and returns the card's values; `change` edits the provenances."""
     like = read_index(lite[0]).entries[0]
 
     def write_meta(tasks: Tasks | None = None, change: Change = lambda of: of, **fields: Any) -> dict[str, Any]:

@@ -41,7 +41,7 @@ def stream_episodes(built_release: Path, split: str) -> Any:
 
 
 def episodes_in_file_order(dataset: Dataset, split: str) -> list[tuple[History, Episode]]:
-    """Return pairs of history and episode of a split in the order of the files: sorted by layout name."""
+    """Return all episodes of a split, each with its history, sorted by layout name like the episode files."""
     layouts = sorted(layout.name for layout in dataset.filter(split=split).layouts)
     parts = [dataset.filter(split=split, layout=name) for name in layouts]
     return [(history, episode) for part in parts for history in part for episode in history.episodes]
@@ -68,7 +68,7 @@ def test_streamed_rows_equal_the_episodes(built_release, dataset, split):
 @pytest.mark.parametrize("obs", ["float32", "uint8"])
 @pytest.mark.parametrize("channels", ["own", "canonical"])
 def test_rendered_observations_equal_those_of_the_histories(built_release, dataset, channels, obs):
-    """Render an episode from a single row of Python lists, and several from a batch of arrays."""
+    """Render one episode from a row of Python lists, and all episodes of a layout from a batch of arrays."""
     opened = dataset.filter(split="train").with_options(obs=obs, channels=channels)
     for layout in opened.layouts:
         expected = [episode.obs for history in opened.filter(layout=layout.name) for episode in history.episodes]

@@ -25,7 +25,7 @@ from tests.helpers.spoiled import change_file
 
 
 def copy_with_index_changes(source: Path, target: Path, changes: dict[int, dict[str, Any]]) -> Path:
-    """Copy published files with changed index lines."""
+    """Copy published files and change lines of the copied index."""
     shutil.copytree(source, target)
     change_file(target / HISTORIES_INDEX, lambda lines: [lines[number].update(changes[number]) for number in changes])
     return target
@@ -55,7 +55,7 @@ def test_family_names_of_the_published_code_are_converted(published_folder, tmp_
 
 @pytest.fixture(scope="module")
 def short_views(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]], np.ndarray]:
-    """Return published files with views of 4 x 5 cells on cramped_up, the written arrays, and views of 5 x 5 cells."""
+    """Return a folder of published files with views of 4 x 5 cells, the written arrays, and views of 5 x 5 cells."""
     folder = tmp_path_factory.mktemp("short")
     written = random_release(folder / "release", layouts=("cramped_up",), teammates=1, streams=2)
     dataset = load_icrl4aht(folder / "release", obs="uint8")

@@ -1,4 +1,4 @@
-"""Test writing releases: round trips with our reader, refused inputs, and interrupted writing."""
+"""Test writing releases: equality of written and read arrays, refused inputs, and interrupted writing."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ MEMORY = 3 * 2**30
 SECONDS = 60
 
 _BOUND = ExitStack()
-LARGE = 2**26  # size in bytes; files of this size or more are not searched for the secret
+LARGE = 2**26  # bytes; size limit of files except shards, and files of this size are not searched for `SECRET`
 Steps = dict[str, Callable[[], Any]]
 
 
@@ -83,8 +83,8 @@ def file_states(folder: Path) -> dict[str, tuple]:
     return states
 
 
-def run_step(step: Callable[[], Any]) -> dict[str, Any]:
-    """Run an operation; return its output or error message, and False for an error that is no `Icrl4ahtError`."""
+def run_operation(step: Callable[[], Any]) -> dict[str, Any]:
+    """Run an operation; return its output or error message, and whether any error is an `Icrl4ahtError`."""
     try:
         with time_limit(SECONDS):
             ours, text = True, str(step() or "")
@@ -114,7 +114,7 @@ def sample_batches(root: Path) -> None:
         dataset.dpt(batch_size=4, context=8)[0]
 
 
-def verify_findings(root: Path) -> str:
+def problems_found_by_verify(root: Path) -> str:
     """Return the problems that `verify` finds; at least one problem is expected."""
     report = verify_release(root, level="deep")
     assert not report.ok, "verify finds nothing"
@@ -130,8 +130,8 @@ def download_release(root: Path, out: Path, case: Case) -> None:
         fetch_planned(plan_download(server.url, to=out / "mirror"))
 
 
-def case_steps(case: Case, root: Path, out: Path) -> Steps:
-    """Return a dict from name to function: the operations to run on a hostile input."""
+def case_operations(case: Case, root: Path, out: Path) -> Steps:
+    """Return the operations to run on a hostile input, as functions by name."""
     if case.kind == "served":
         return {"download": lambda: download_release(root, out, case)}
     if case.kind == "published":
@@ -142,7 +142,7 @@ def case_steps(case: Case, root: Path, out: Path) -> Steps:
     return {
         "read": lambda: read_all_fields(root),
         "sample": lambda: sample_batches(root),
-        "verify": lambda: verify_findings(root),
+        "verify": lambda: problems_found_by_verify(root),
         "quick": lambda: verify_release(root, level="quick"),
         "convert": lambda: to_release(load_icrl4aht(root), out / "full", "full"),
         "published": lambda: to_published(load_icrl4aht(root), out / "published"),
@@ -151,7 +151,7 @@ def case_steps(case: Case, root: Path, out: Path) -> Steps:
 
 
 def run_in_folder(folder: Path, base: Path, case: Case) -> dict[str, Any]:
-    """Run all operations of a case; return outcomes, whether input files changed, leaks, and the bytes written."""
+    """Run all operations of a case; return outcomes, whether inputs changed, leaks of `SECRET`, and bytes written."""
     folder.mkdir()
     root, out = folder / "root", folder / "out"
     shutil.copytree(base, root)
@@ -160,7 +160,7 @@ def run_in_folder(folder: Path, base: Path, case: Case) -> dict[str, Any]:
     case.spoil(root)
     before = file_states(root), file_states(folder / "outside"), sorted(folder.iterdir())
     os.chdir(out)
-    outcomes = {name: run_step(step) for name, step in case_steps(case, root, out).items()}
+    outcomes = {name: run_operation(step) for name, step in case_operations(case, root, out).items()}
     touched = before != (file_states(root), file_states(folder / "outside"), sorted(folder.iterdir()))
     written = [out / name for name in files_below(out)]
     leaked = [str(path) for path in written if path.is_symlink() or not path.is_file() or _contains_secret(path)]
@@ -182,7 +182,7 @@ def make_valid_inputs(folder: Path) -> None:
 
 
 def limit_process() -> None:
-    """Limit this process's memory, downloads and waits before retries, and turn warnings into errors."""
+    """Limit this process's memory, file sizes and waits before retries, and turn warnings into errors."""
     warnings.simplefilter("error")
     clients._WAITS = (0.01, 0.01, 0.01)
     files.LARGEST = LARGE

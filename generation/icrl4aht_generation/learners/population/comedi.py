@@ -53,7 +53,7 @@ class CoMeDi(Algorithm):
         new, frozen = np.zeros(quarter, int), np.ones(quarter, int)
         first_half = np.arange(quarter) < quarter // 2
         cross = np.stack([np.where(first_half, frozen, new), np.where(first_half, new, frozen)])
-        # Partners alternate, so both halves of `cross` have equally many environments with each partner.
+        # Alternate the partners, because the frozen member is the ego in only one half of the environments of `cross`.
         with_self = np.arange(quarter) % 2 == 0
         mixed = np.where(with_self, 0, cross)
         play = np.stack([new, new])

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from icrl4aht_generation.learners.population.brdiv import pairs_assignment
 from icrl4aht_generation.learners.population.population import Algorithm, Assignment
 
-_SELF_PLAY = 0.5  # multiplier on both diagonals, so a member's self-play return has at least the weight 1
+_SELF_PLAY = 0.5  # diagonal of both multiplier matrices, so each self-play return has at least the weight 1
 
 
 class Multipliers(NamedTuple):
@@ -69,7 +69,8 @@ class LBRDiv(Algorithm):
     def adapt(self, memory: Multipliers, returns, seen) -> Multipliers:
         """Return new multipliers max(multiplier - eta (J(pi_i, BR_i) - J(other pair) - eps), 0).
 
-        Diagonal entries stay the same. The others change only if there are new episodes and both returns are known.
+        Here eta is `learning_rate`, and eps is `tolerance`. Diagonal entries stay the same. The others change only if
+        there are new episodes and both returns are known.
         """
         k = self.members
         # `returns` is indexed [ego, teammate]; best responses, K..2K-1, are the egos.

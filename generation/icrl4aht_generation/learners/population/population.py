@@ -68,12 +68,12 @@ class Assignment(NamedTuple):
 
     @property
     def partner(self) -> np.ndarray:
-        """Policy of the other agent in each slot's environment, int (2 N,)."""
+        """Policy of the other agent in each slot's environment, an int array of shape (2 N,)."""
         return self.policy[::-1].ravel()
 
     @property
     def self_play(self) -> np.ndarray:
-        """Whether both policies in each environment have the same `group`, bool (N,)."""
+        """Whether both policies in each environment have the same `group`, a bool array of shape (N,)."""
         return self.group[self.policy[0]] == self.group[self.policy[1]]
 
 
@@ -105,12 +105,12 @@ class Algorithm:
 
 
 class PolicyGroup(NamedTuple):
-    """Successive policies with equally many slots, which one vmap can update.
+    """Consecutive policies that one vmap can update, because each policy has the same number of slots.
 
     Attributes:
-        first: number of the first policy.
+        first: index of the first policy.
         agent_slots: int (G, M), slots of each policy; slots from which the policy learns come first.
-        counting: how many of the M slots each policy learns from.
+        counting: number of slots from which each policy learns, at most M.
     """
 
     first: int
@@ -122,11 +122,11 @@ class PolicyGroup(NamedTuple):
         return slice(self.first, self.first + len(self.agent_slots))
 
     def take(self, tree: Any) -> Any:
-        """Return the group's rows of a tree with leaves (P, ...)."""
+        """Return the group's rows of a pytree with leaves of shape (P, ...)."""
         return jax.tree.map(lambda leaf: leaf[self._rows], tree)
 
     def put(self, tree: Any, rows: Any) -> Any:
-        """Return a tree with leaves (P, ...) after replacing the group's rows."""
+        """Return a pytree with leaves of shape (P, ...) after replacing the group's rows."""
         return jax.tree.map(lambda leaf, new: leaf.at[self._rows].set(new), tree, rows)
 
 
@@ -303,7 +303,7 @@ class Population:
             played = played._replace(partner=partner, weight=weight[slots][None])
 
             def by_policy(leaf, shape=group.agent_slots.shape, counting=group.counting):
-                """Reshape an array (T, G * M, ...) to (G, T, counting, ...), with only the slots to learn from."""
+                """Reshape from (T, G * M, ...) to (G, T, counting, ...), and keep only the slots for learning."""
                 return jnp.moveaxis(leaf.reshape(leaf.shape[0], *shape, *leaf.shape[2:]), 1, 0)[:, :, :counting]
 
             # Every policy starts from its old parameters, so the order of the groups does not matter.

@@ -31,7 +31,7 @@ def act_assembly_line(params, memory: Key[Array, ""], scene: Scene) -> tuple[Int
     following, u = draw(memory)
     idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _hesitation_factor(scene))
     makes_room = _should_step_aside(scene)
-    # As in the published code, mistakes never replace deliveries and emergency moves.
+    # As in the published code, mistakes never replace deliveries, or putting down an ingredient once a soup is done.
     final, action = _choose_action(scene, params, abandons=u[2] < params["task_abandon_prob"])
     slips = ~(idles | makes_room | final)
     action, following = _with_mistakes(scene, params, action, slips, u[1], following)
@@ -40,13 +40,13 @@ def act_assembly_line(params, memory: Key[Array, ""], scene: Scene) -> tuple[Int
 
 
 def _hesitation_factor(scene: Scene) -> Array:
-    """Return a factor of the chance to hesitate, float32 in 0..0.9; each cell has a fixed factor."""
+    """Return the fixed factor of the agent's cell in the chance to hesitate, float32 in 0..0.9."""
     x, y = jnp.asarray(scene.tables.column)[scene.own_cell], jnp.asarray(scene.tables.row)[scene.own_cell]
     return jnp.asarray(_HESITATION_FACTORS)[(7 * x + 13 * y) % 10]
 
 
 def _choose_action(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Choose an action by the first rule that applies. Return whether it is exempt from mistakes, and the action."""
+    """Return whether the action is exempt from mistakes, and the action, chosen by the first rule that applies."""
     empty, plate, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_ingredient
     soup, cooking = jnp.any(scene.cooked), jnp.any(scene.cooking)
     final = scene.holds_dish | (ingredient & soup)
@@ -69,7 +69,7 @@ def _choose_action(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Boo
             Rule(runner & empty, scene.piles_of(scene.needed - coming > 0)),
             Rule(plater & plate, scene.cooked),
             Rule(plater & empty, scene.plate_piles),
-            # The remaining rules let agents without a possible task wait at the place of their next task.
+            # By the remaining rules, agents without a possible task go to the target of their next task and wait.
             Rule(plater & (plate | empty), scene.pots_in_use, waits=True),
             Rule((runner & empty) | (plater & plate), scene.pots, waits=True),
             Rule(empty | (plater & plate), scene.buttons, waits=True),

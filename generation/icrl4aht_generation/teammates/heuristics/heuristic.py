@@ -17,7 +17,7 @@ from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.options import Share
 from icrl4aht_generation.paths import Scene
-from icrl4aht_generation.policy import Noise, Policy, Situation, on_layout, sometimes_random
+from icrl4aht_generation.policy import Noise, Policy, Situation, on_layout, randomize_action
 
 RANDOM_ACTIONS = "random_actions"
 """Optional parameter of every family: chance of a uniformly random action in a step. This parameter is an addition to
@@ -140,7 +140,7 @@ def _policy_functions(heuristic: Heuristic, slot: int, noise: Noise, mixed: bool
     def mixed_act(params, memory: Any, view: Situation, key: Key[Array, ""]):
         action, own = act(params, memory[0], view, key)
         following, drawn = jax.random.split(memory[1])
-        return sometimes_random(drawn, params[RANDOM_ACTIONS], action), (own, following)
+        return randomize_action(drawn, params[RANDOM_ACTIONS], action), (own, following)
 
     return (mixed_init, mixed_act) if mixed else (init, act)
 

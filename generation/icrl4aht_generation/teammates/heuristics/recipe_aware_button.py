@@ -193,7 +193,7 @@ def _step(scene: Scene, target: Int[Array, ""], cramped: Bool[Array, ""]) -> Int
 
 
 def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Return whether a partner with an ingredient is about as near to a pot as the agent, and a step away from it."""
+    """Return whether a partner with an ingredient is about as near to a pot as the agent, and a step to give way."""
     access = scene.single_access_cell(pot)
     as_near = scene.manhattan(scene.partner_cell, access) <= scene.manhattan(scene.own_cell, access) + 1
     gives_way = is_ingredient(scene.partner_hand) & (access >= 0) & as_near
@@ -201,7 +201,7 @@ def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[
 
 
 def _should_leave_plates(scene: Scene) -> Bool[Array, ""]:
-    """Return whether the first plate pile has only one access cell, and the partner carries no plate or dish."""
+    """Return whether to fetch no plate: the first pile has one access cell, and the partner has no plate or dish."""
     first = jnp.argmax(scene.plate_piles)
     single = jnp.any(scene.plate_piles) & (scene.single_access_cell(first) >= 0)
     carries = (scene.partner_hand == PLATE) | is_dish(scene.partner_hand)

@@ -69,7 +69,7 @@ def _rule_action(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, "
         Rule(keeps_dish | (ingredient & hoards & (u < 0.8)), scene.empty_counters),
         Rule(empty & counters & soup, scene.needed_piles),
     ]
-    # Only targets that every soup needs have a fallback outside the territory.
+    # Each mask comes with a flag: whether the agent may use targets outside its territory as a fallback.
     goals, nonfull, put_down, cooked, heating, plates, staged, needed = _territory_targets(
         scene,
         params,
@@ -126,7 +126,8 @@ def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
 def _territory_targets(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array, "masks cells"]:
     """Return the reachable cells of each mask in the agent's territory, or else in the shared territory.
 
-    If both are empty, the result is all reachable cells for masks with a fallback, and no cells for other masks.
+    If both are empty, the result is all reachable cells for masks with a fallback, and no cells for other masks. With
+    low strictness or urgent soups, the result is all reachable cells of each mask.
     """
     # Two finished soups give the highest urgency: then even strict teammates help outside their territory.
     urgency = jnp.minimum(jnp.sum(scene.cooked) / 2, 1)

@@ -79,7 +79,7 @@ def _choose_action(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[I
 
 
 def _intent_values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array, " 8"], Array]:
-    """Return weight x value of each intent, float32 (8,), and whether the intent is allowed, bool (8,)."""
+    """Return the weighted values of the eight intents, and whether each intent is allowed, arrays of shape (8,)."""
     cooking, cooked, nonfull = (jnp.sum(mask) for mask in (scene.cooking, scene.cooked, scene.fillable_pot_cells))
     can_add = jnp.any(scene.reachable(scene.fillable_pot_cells))
     can_put_down = jnp.any(scene.reachable(scene.empty_counters))
