@@ -45,6 +45,7 @@ def test_progress_speed_excludes_work_before_a_resume():
 
 def test_progress_lines_are_printed_during_long_steps(monkeypatch, capsys):
     monkeypatch.setattr(progress, "FIRST_LINE_SECONDS", 0.02)
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.02)  # a slow machine may have no task yet at the first line
     with progress_bars(of_bytes=True) as show:
         show("finished", 4, 4)
         show("of unknown size", 4, None)
