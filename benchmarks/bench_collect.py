@@ -2,12 +2,12 @@
 
 One JSON line for each part:
 
-    noise   recorded transitions/s of noise histories, including writing and hashing, and the seconds to compile
-    speed   recorded transitions/s of a complete collection (PPO, recording, writing), and the share of time for
+    noise:  recorded transitions/s of noise histories, including writing and hashing, and the seconds to compile
+    speed:  recorded transitions/s of a complete collection (PPO, recording, writing), and the share of time for
             recording and writing
-    memory  peak resident memory of a collection with the paper's 1024 environments, and of its learner without
+    memory: peak resident memory of a collection with the paper's 1024 environments, and of its learner without
             recording, each measured in a separate process
-    bytes   bytes per transition of the bundled histories, including all files: `lite` and `full` releases compared
+    bytes:  bytes per transition of the bundled histories, including all files: `lite` and `full` releases compared
             with the paper's format (App. D.1: float32 observations, gzip-6, one group per history)
 """
 

@@ -1,16 +1,16 @@
 """Compare steps/s of environments, and of learning in them, with JaxMARL's OvercookedV2: `make bench-env`.
 
-    steps    environments without learning
-    layouts  a different generated layout in each environment, compared with one layout, and with JaxMARL on one layout
-    ippo     JaxMARL's IPPO on our environment and on JaxMARL's environment: `PEER=file`
+    steps:   environments without learning
+    layouts: a different generated layout in each environment, compared with one layout, and with JaxMARL on one layout
+    ippo:    JaxMARL's IPPO on our environment and on JaxMARL's environment: `PEER=file`
 
 In the part `steps`, both environments run in the same compiled loop with random actions and automatic resets, which
 writes both agents' observations in every step into a donated buffer. One JSON line is printed for each layout, number
 of environments, and content of the buffer:
 
-    uint8    observations as uint8 (JaxMARL's int32 observations are converted)
-    float32  observations as float32
-    state    our state records, from which observations can be rendered later; JaxMARL's observations as uint8
+    uint8:   observations as uint8 (JaxMARL's int32 observations are converted)
+    float32: observations as float32
+    state:   our state records, from which observations can be rendered later; JaxMARL's observations as uint8
 
 In the part `ippo`, JaxMARL's learner (a copy of `ippo_rnn_overcooked_v2.py`) makes 10 updates with either environment,
 see `benchmarks.peers`. The learner's network takes most of the time, so a faster environment has less effect.

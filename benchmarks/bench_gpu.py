@@ -1,10 +1,10 @@
 """Measure the speed of learning, training and evaluation on a GPU: `make bench-gpu`. On a CPU, sizes are tiny.
 
-    device     machine, software and settings
-    product    TFLOP/s of one large matrix product; float32 products use TF32 on a GPU by default, see `measure_product`
-    learner    steps/s of PPO training of an ego with teammate H4, with the paper's network, in 1,024 environments
-    train      seconds of an AD training step (B = 1024, L = 500 for the paper's small size), and wait for the loader
-    act        steps/s of the evaluator with cached acting, on the tasks of one layout
+    device:    machine, software and settings
+    product:   TFLOP/s of one large matrix product; float32 products use TF32 on a GPU by default, see `measure_product`
+    learner:   steps/s of PPO training of an ego with teammate H4, with the paper's network, in 1,024 environments
+    train:     seconds of an AD training step (B = 1024, L = 500 for the paper's small size), and wait for the loader
+    act:       steps/s of the evaluator with cached acting, on the tasks of one layout
 
 One JSON line is printed for each case, with the error if the case fails. At the time limit the process ends, with a
 line for each case without a result. Learners use XLA's deterministic operations, as in `generate`. Models are

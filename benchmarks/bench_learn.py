@@ -1,11 +1,11 @@
 """Measure the speed of learning and evaluation: `make bench-learn`.
 
-    ego      steps/s of PPO training of an ego with teammate H4, for each profile compared with the first profile
-    jaxmarl  steps/s of self-play with the paper's network, compared with JaxMARL's recurrent IPPO: `PEER=file`
-    ad       transitions/s of AD training on state records, for each encoder compared with the paper's encoder on
+    ego:     steps/s of PPO training of an ego with teammate H4, for each profile compared with the first profile
+    jaxmarl: steps/s of self-play with the paper's network, compared with JaxMARL's recurrent IPPO: `PEER=file`
+    ad:      transitions/s of AD training on state records, for each encoder compared with the paper's encoder on
              float32 observations from a reader of the published format
-    act      steps/s of the evaluator with `cached` acting, compared with `exact` acting
-    tasks    minutes to evaluate all 160 test tasks with `cached` acting, including compilation
+    act:     steps/s of the evaluator with `cached` acting, compared with `exact` acting
+    tasks:   minutes to evaluate all 160 test tasks with `cached` acting, including compilation
 
 One JSON line is printed for each measurement. Models are untrained, since speed does not depend on the parameters.
 """

@@ -2,10 +2,10 @@
 
 All readers make the same windows of the same histories, which are bundled histories rotated by complete episodes:
 
-    published   one thread reads float32 data, compressed by gzip level 6 in chunks of 4096 steps, with h5py; it merges
+    published:  one thread reads float32 data, compressed by gzip level 6 in chunks of 4096 steps, with h5py; it merges
                 the slices of a history, and has a chunk cache of 512 MB
-    fair        h5py reads the same data in chunks of 500 steps directly into a preallocated batch
-    ours        reads state records, or uint8 or float32 observations, with each cache (ram, mmap, and stream with and
+    fair:       h5py reads the same data in chunks of 500 steps directly into a preallocated batch
+    ours:       reads state records, or uint8 or float32 observations, with each cache (ram, mmap, and stream with and
                 without decoded chunks in memory), into reused batch buffers
 
 Readers take turns in rounds. One JSON line is printed for each of our readers and each peer, with their ratio and

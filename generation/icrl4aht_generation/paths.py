@@ -222,7 +222,7 @@ class Scene:
 
     @staticmethod
     def ingredient_counts(item: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
-        """Return three counts for the pieces in an item: one per ingredient of the layout by ascending id, then 0."""
+        """Return how many pieces of each ingredient an item has; counts are in order of id and padded to 3 with 0."""
         # An item byte has two bits for each ingredient, above the bits of plate and cooked.
         shift = 2 + 2 * jnp.arange(3, dtype=jnp.uint8)
         return (item[..., None] >> shift & 3).astype(jnp.int32)

@@ -121,7 +121,7 @@ def show(
     if plot is not None:
         check_output(plot, overwrite)
     if isinstance(root, Path) and str(root).isdecimal() and not root.exists():
-        raise click.UsageError(f"{root}: no such folder; give a history's id as --history {root}")
+        raise click.UsageError(f"{root}: no such folder; if this is a history's id, use --history {root}")
     dataset = load_icrl4aht(root, **filters)
     if history_id is None:
         facts = summarize_selection(dataset)

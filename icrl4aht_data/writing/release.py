@@ -228,7 +228,7 @@ class _ShardWriter:
         """Return the index entry of a history; the history's id and position in a shard are not set yet."""
         arrays, task = history.arrays, new.task
         if not 0 <= history.env_idx < 2**63:
-            raise OptionError(f"task {task.task_id}: env_idx: expected a number from 0, found {history.env_idx}")
+            raise OptionError(f"task {task.task_id}: env_idx: expected at least 0, found {history.env_idx}")
         if not 0 <= history.learner < (learners := new.provenance.learners or 1):
             raise OptionError(
                 f"task {task.task_id}: learner: expected 0 to {learners - 1}, since provenance has {learners} "

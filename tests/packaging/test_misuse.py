@@ -44,7 +44,7 @@ MISUSED = """
 lst | unknown command 'lst'; valid: list, show,
 list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
 verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
-show 158 | 158: no such folder; give a history's id as --history 158
+show 158 | 158: no such folder; if this is a history's id, use --history 158
 show --history 9999 | this selection has no history [9999], its ids are within 0..
 browse --out page.txt | page.txt: expected a name that ends in .html
 browse --out none/page.html | no folder none: make it first, or give another path
@@ -62,7 +62,7 @@ train rl2 --layout demo_wide --size tiny | --size: cannot be used with rl2, whic
 train rl2 --layout all --next-obs --context 5 | --context, --next-obs: cannot be used with rl2, which learns by playing
 train ad --layout demo_wide --epochs 2 | --epochs: cannot be used with ad, only with rl2, which learns by playing
 research reference --name rl2-reference --no-evaluate --bundle-as rl2-x | because the card states its results
-research reference --name rl2-reference --track preference | no model of this track exists for rl2-reference; leave out --track
+research reference --name rl2-reference --track preference | no model of this track exists for rl2-reference
 research reference --name rl2-reference --bundle-as Bad-Name | name = 'Bad-Name': expected lowercase words
 results | Missing option '--out'
 submit empty --out r.json --about a | Missing option '--data'

@@ -247,7 +247,7 @@ def test_user_packages_named_like_folders_of_the_project_do_not_break_commands(b
     assert "evaluate" in run("python", "-m", "icrl4aht_data", "--help")
 
 
-def test_extras_named_in_messages_allow_training_and_drawing(jax_environment, wheel, tmp_path):
+def test_training_and_drawing_need_only_the_extras_that_messages_name(jax_environment, wheel, tmp_path):
     """The extra `jax` is enough to train and evaluate models; drawing needs the install command shown in messages."""
     run = command_runner(jax_environment, tmp_path)
     run("python", "-c", EVALUATE)

@@ -89,7 +89,7 @@ def evaluate(
         out: folder for one JSON file per task. Stored results with the same settings are not computed again.
         details: further settings that the results depend on, as JSON; stored with the results. The entry `trained_on`
             states the training data, which reports compare with the tasks: see
-            `icrl4aht_baselines.training.seen.read_trained_on`.
+            `icrl4aht_baselines.training.seen.parse_training_record`.
         played: function for progress, called by several threads with the number of episodes played or found in `out`
             since the last call.
         programs: compiled programs of earlier evaluations of the ego; new programs are added.
@@ -253,7 +253,7 @@ def prepare_rollout(
     programs: ProgramCache | None = None,
     earlier: PreparedRollout | None = None,
 ) -> PreparedRollout:
-    """Compile the episodes of tasks that share a teammate family.
+    """Compile the programs that play tasks of one teammate family.
 
     Tasks on several layouts need an ego whose functions and parameters are the same on all of them, see
     `EvaluationRollout`.

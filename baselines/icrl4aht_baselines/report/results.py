@@ -31,7 +31,13 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, Protocol, bundled_tasks
 from icrl4aht_baselines.evaluate.results import RESULTS, Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
-from icrl4aht_baselines.training.seen import TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on, sorted_overlaps
+from icrl4aht_baselines.training.seen import (
+    TRAINED_ON,
+    SeenInTraining,
+    find_overlaps,
+    parse_training_record,
+    sorted_overlaps,
+)
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, PREFERENCE, TRACKS, family_sort_key, layout_sort_key, layout_track
 from icrl4aht_data.benchmark.tasks import Task, write_tasks
 from icrl4aht_data.errors import OptionError
@@ -394,8 +400,8 @@ def find_training_record(settings: dict[str, Any], where: str) -> dict[str, Seen
         return {"": SeenInTraining() if settings["agent"] in AGENTS and not details else None}
     entries = details[TRAINED_ON]
     if isinstance(entries, dict) and entries.keys() <= TRACKS.keys():
-        return {track: read_trained_on(entries[track], where) if track in entries else None for track in TRACKS}
-    return {"": read_trained_on(entries, where)}
+        return {track: parse_training_record(entries[track], where) if track in entries else None for track in TRACKS}
+    return {"": parse_training_record(entries, where)}
 
 
 def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:

@@ -42,7 +42,7 @@ class _Entry(Struct):
     teammates: list[str] | None = None
 
 
-def read_trained_on(entries: Any, where: str) -> SeenInTraining:
+def parse_training_record(entries: Any, where: str) -> SeenInTraining:
     """Return the layouts and teammates that a record of training data states.
 
     Args:

@@ -1,9 +1,9 @@
 """Encoder of observations for learners and sequence models: convolutions, or a dense layer on flat observations.
 
 Inputs are observations, or a compact form that is computed from state records. An encoder has the same parameters for
-both inputs, and equal results up to the order of summation. `WindowWords` are for the convolutions: a 1 x 1 convolution
-sees one cell, so it is computed once per word, which is a possible content of a cell. `WindowEntries` are for the dense
-layer: most entries of an agent's flat window are always 0, because the agent stays in its room. B denotes the batch
+both inputs, and equal results up to the order of summation. Convolutions take a `WordWindow`: a 1 x 1 convolution sees
+one cell, so it is computed once per word, which is a possible content of a cell. The dense layer takes `WindowEntries`:
+most entries of an agent's flat window are always 0, because the agent stays in its room. B denotes the batch
 dimensions.
 
 Convolutions are matrix products: a 3 x 3 SAME convolution of a 5 x 5 patch is one dense matrix built from its kernel.
@@ -31,7 +31,7 @@ MLP_WIDTH = 64
 """Width of the first dense layer of encoder `mlp`."""
 
 
-class WindowWords(NamedTuple):
+class WordWindow(NamedTuple):
     """Observations as word ids, one for the content of each visible cell.
 
     Attributes:
@@ -69,7 +69,7 @@ class GroupedWords(NamedTuple):
     groups: Int[Array, ""]
 
 
-Seen = Num[Array, "*B 5 5 C"] | WindowWords | GroupedWords | WindowEntries
+Seen = Num[Array, "*B 5 5 C"] | WordWindow | GroupedWords | WindowEntries
 """Input of an encoder: observations, uint8 or float, or one of their compact forms."""
 
 _BLOCKS = 4
@@ -78,7 +78,7 @@ _BLOCKS = 4
 
 @dataclass(frozen=True)
 class CompactView:
-    """Converter of state records to inputs of an encoder: `WindowWords`, `WindowEntries`, or observations for `paper`.
+    """Converter of state records to inputs of an encoder: `WordWindow`, `WindowEntries`, or observations for `paper`.
 
     Attributes:
         kind: kind of the encoder.
@@ -111,7 +111,7 @@ class CompactView:
         """Return the encoder's input; `layout_number` is needed for several layouts, see `CellWords.ids`."""
         batch = record.shape[:-1]
         if self.kind == "words":
-            return WindowWords(self.words.ids(record, layout_number))
+            return WordWindow(self.words.ids(record, layout_number))
         if layout_number is None:
             obs: Any = observe(self.layouts[0], record, EGO, self.canonical)
         else:
@@ -121,7 +121,7 @@ class CompactView:
 
     def observations(self, seen: Seen) -> Num[Array, "*B 5 5 C"]:
         """Convert an encoder's input back to observations."""
-        if isinstance(seen, (WindowWords, GroupedWords)):
+        if isinstance(seen, (WordWindow, GroupedWords)):
             flat = jnp.asarray(self.words.channels)[seen.ids]
         elif isinstance(seen, WindowEntries):
             zeros = jnp.zeros((*seen.values.shape[:-1], VISIBLE * self.channels), seen.values.dtype)
@@ -132,13 +132,13 @@ class CompactView:
 
 
 def group_equal(seen: Seen) -> Seen:
-    """Group equal observations of an input of kind `WindowWords`, and return any other input unchanged.
+    """Group equal observations of an input of kind `WordWindow`, and return any other input unchanged.
 
     Observations are sorted by a hash, and then compared exactly: if different observations have equal hashes, every
     observation becomes a separate group. Sorting needs all observations on one device, so with several devices nothing
     is grouped.
     """
-    if not isinstance(seen, WindowWords) or jax.device_count() > 1:
+    if not isinstance(seen, WordWindow) or jax.device_count() > 1:
         return seen
     shape, ids = seen.ids.shape[:-1], jnp.asarray(seen.ids).reshape(-1, VISIBLE)
     number = jnp.arange(len(ids), dtype=jnp.int32)
@@ -214,7 +214,7 @@ class WindowEncoder(nn.Module):
         ids = seen.ids.reshape(-1, VISIBLE)[rows]
 
         def encode(variables: Any, ids: Array) -> Array:
-            features: Any = encoder.apply(variables, WindowWords(ids))
+            features: Any = encoder.apply(variables, WordWindow(ids))
             return features
 
         shape = jax.eval_shape(encode, variables, ids[0])
@@ -227,16 +227,16 @@ class WindowEncoder(nn.Module):
         _, features = jax.lax.scan(encode_block, None, (jnp.arange(_BLOCKS), ids))
         return features.reshape(-1, self.features)[seen.group]
 
-    def _encode_cells(self, seen: Num[Array, "*B 5 5 C"] | WindowWords | WindowEntries) -> Float[Array, "*B 25 F"]:
+    def _encode_cells(self, seen: Num[Array, "*B 5 5 C"] | WordWindow | WindowEntries) -> Float[Array, "*B 25 F"]:
         """Apply the 1 x 1 convolutions to each cell; contents that the rules cannot produce become NaN."""
-        if isinstance(seen, WindowWords):
+        if isinstance(seen, WordWindow):
             x = jnp.asarray(_required_view(self.view).words.channels, self.dtype)
         else:
             obs: Any = seen
             x = obs.reshape(*obs.shape[:-3], VISIBLE, obs.shape[-1]).astype(self.dtype)
         for width in self.pointwise:
             x = nn.relu(orthogonal_dense(width)(x))
-        return x.at[-1].set(jnp.nan)[seen.ids] if isinstance(seen, WindowWords) else x
+        return x.at[-1].set(jnp.nan)[seen.ids] if isinstance(seen, WordWindow) else x
 
 
 class FlatDense(nn.Module):

@@ -283,7 +283,7 @@ def _new_task(
 
 
 def _script_label_record(source: str, references: ReferenceEgos) -> ExpertLabels:
-    """Return the provenance record of labels that are a script's actions."""
+    """Return the provenance record for labels that are actions of a scripted policy."""
     if source == "noise":
         action = "scripted oracle, which sees the full state"
         return ExpertLabels(None, action, return_greedy=references.oracle, episodes=references.episodes, view="state")

@@ -165,7 +165,7 @@ def test_stored_control_results_are_reused_only_for_same_partners(compiled_progr
 def test_memory_control_resets_host_agents_before_each_episode(tmp_path):
     agent, short = HostRecorder(), dataclasses.replace(FOUR, steps=5)
     evaluate_controls("host", from_host(agent), TASKS, short)
-    log = [inputs[::5] for inputs in agent.seen]  # for each reset, the inputs in the first step of each episode
+    log = [inputs[::5] for inputs in agent.seen]  # one log per reset of the agent, with the first step of each episode
     # Each of the two families has one reset without a control, four with memory cleared, one with swapped teammates.
     assert [len(episodes) for episodes in log] == [4, 4] + [1] * 8 + [4, 4]
     plain, cleared, swapped = log[0], [episodes[0] for episodes in log[2:6]], log[10]

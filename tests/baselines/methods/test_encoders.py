@@ -70,7 +70,7 @@ def test_equal_observations_are_grouped_unless_hashes_collide(monkeypatch, colli
     if collide:
         monkeypatch.setattr(encoder, "_hash_words", lambda ids: (jnp.zeros(len(ids), jnp.uint32),) * 2)
     ids = np.random.default_rng(0).integers(0, 300, (4, 25))[[[0, 1, 0, 2], [1, 1, 3, 0]]]
-    grouped: Any = encoder.group_equal(encoder.WindowWords(jnp.asarray(ids, jnp.int32)))
+    grouped: Any = encoder.group_equal(encoder.WordWindow(jnp.asarray(ids, jnp.int32)))
     count = int(grouped.groups)
     assert count == (8 if collide else 4)
     assert encoder.encoding_metrics(grouped)["distinct_observations"] == count / 8

@@ -31,7 +31,7 @@ from icrl4aht_baselines.online.rl2 import (
 from icrl4aht_baselines.online.teammates import BEHAVIOURS, MIXTURE, mixed_chances, with_behaviours
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
-from icrl4aht_baselines.training.seen import read_trained_on
+from icrl4aht_baselines.training.seen import parse_training_record
 from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_generation.layouts.rearranged import rearranged_layouts
 from icrl4aht_generation.policy import Policy
@@ -280,7 +280,7 @@ class TestPreparation:
         assert {cell["layout"] for cell in added.values()} == {"cramped_up"}
         ids = {teammate_id(task.teammate) for task in here}
         assert {one for cell in added.values() for one in cell["teammates"]} == ids
-        seen = read_trained_on(job.about["trained_on"], "here")
+        seen = parse_training_record(job.about["trained_on"], "here")
         assert seen.layouts == ("cramped_up",) and set(seen.teammates) >= set(added)
         assert sum(job.about["histories"]["groups"].values()) == len(job.trainer.tasks)
 

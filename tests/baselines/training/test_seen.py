@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from icrl4aht_baselines.training.histories import training_record
-from icrl4aht_baselines.training.seen import SeenInTraining, read_trained_on
+from icrl4aht_baselines.training.seen import SeenInTraining, parse_training_record
 from icrl4aht_generation.teammates.instances import published_task
 
 from icrl4aht_data import Dataset, load_icrl4aht
@@ -26,7 +26,7 @@ def test_training_record_lists_all_teammates_of_each_family(dataset):
         assert cell["teammates"] == teammate_ids(dataset, of_cell.ids.tolist())
         assert len(cell["teammates"]) == cell["tasks"]
         found[cell["algorithm"]] = tuple(cell["teammates"])
-    assert read_trained_on(training_record(dataset), "run.json") == SeenInTraining(("demo_wide",), found)
+    assert parse_training_record(training_record(dataset), "run.json") == SeenInTraining(("demo_wide",), found)
 
 
 def test_teammate_id_depends_only_on_the_policy():
@@ -50,18 +50,18 @@ def test_teammate_ids_are_none_for_releases_without_tasks(dataset, monkeypatch):
 def test_training_records_of_the_same_algorithm_are_merged():
     greedy = {"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["b"]}
     learned = {"layout": "demo_wide", "split": "train", "family": "rl", "algorithm": "fcp", "teammates": ["a", "c"]}
-    found = read_trained_on([greedy, greedy | {"layout": "demo_simple", "teammates": ["a"]}, learned], "run.json")
+    found = parse_training_record([greedy, greedy | {"layout": "demo_simple", "teammates": ["a"]}, learned], "run.json")
     expected = {"utility_greedy": ("a", "b"), "fcp": ("a", "c")}
     assert found == SeenInTraining(("demo_wide", "demo_simple"), expected)
-    unknown = read_trained_on([learned, learned | {"teammates": None}], "run.json")
+    unknown = parse_training_record([learned, learned | {"teammates": None}], "run.json")
     assert unknown.teammates == {"fcp": None}
-    any_algorithm = read_trained_on([{"layout": "demo_wide", "family": "rl"}], "run.json")
+    any_algorithm = parse_training_record([{"layout": "demo_wide", "family": "rl"}], "run.json")
     assert any_algorithm.teammates == dict.fromkeys(("fcp", "brdiv", "lbrdiv", "comedi"))
-    assert read_trained_on([], "run.json") == SeenInTraining()
-    (alias,) = read_trained_on([{"layout": "demo_cook_wide", "family": "H4"}], "run.json").layouts
+    assert parse_training_record([], "run.json") == SeenInTraining()
+    (alias,) = parse_training_record([{"layout": "demo_cook_wide", "family": "H4"}], "run.json").layouts
     assert alias == "demo_wide"
     with pytest.raises(OptionError, match=r"trained_on: unknown layout 'demo_wid'.*mean 'demo_wide'"):
-        read_trained_on([{"layout": "demo_wid", "family": "H4"}], "run.json")
+        parse_training_record([{"layout": "demo_wid", "family": "H4"}], "run.json")
 
 
 @pytest.mark.parametrize(
@@ -77,4 +77,4 @@ def test_training_records_of_the_same_algorithm_are_merged():
 )
 def test_invalid_training_record_raises_error(entries):
     with pytest.raises(OptionError, match=r"run\.json: trained_on: expected "):
-        read_trained_on(entries, "run.json")
+        parse_training_record(entries, "run.json")

@@ -147,7 +147,7 @@ class TestStopping:
 
     def test_sigterm_saves_checkpoint_and_training_resumes_bit_for_bit(self, full_run, tmp_path):
         with pytest.raises(
-            TrainingStopped, match=r"stopped by SIGTERM after step 4 of 7.* repeat the command to resume from the saved state"
+            TrainingStopped, match=r"stopped by SIGTERM after step 4 of 7.* repeat the command to resume"
         ) as stopped:
             train_tiny(tmp_path, done=terminate_at_4)
         assert stopped.value.code == 143

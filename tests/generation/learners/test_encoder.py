@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from icrl4aht_generation.learners.encoder import CompactView, WindowEncoder, WindowEntries, WindowWords
+from icrl4aht_generation.learners.encoder import CompactView, WindowEncoder, WindowEntries, WordWindow
 
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
@@ -45,7 +45,7 @@ def test_compact_inputs_give_the_features_and_gradients_of_observations(kind):
     obs = jnp.asarray(observe(LAYOUT, RECORDS, 0))
     view = CompactView(kind, (LAYOUT,))
     seen = view(jnp.asarray(RECORDS))
-    assert isinstance(seen, WindowWords if kind == "words" else WindowEntries)
+    assert isinstance(seen, WordWindow if kind == "words" else WindowEntries)
     plain, compact = encoder("paper" if kind == "words" else kind, view), encoder(kind, view)
     params = plain.init(jax.random.key(1), obs)
     own = compact.init(jax.random.key(1), seen)

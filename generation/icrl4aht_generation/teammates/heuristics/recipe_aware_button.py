@@ -113,7 +113,7 @@ def _choose_action(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[
     # Blocking and wrong ingredients can only replace the rules after `first_rules`.
     settled = chosen.found & (chosen.number < len(first_rules))
     action = scene.go_to(chosen.target, chosen.waits, _step(scene, chosen.target, cramped))
-    gives_way, aside = _yield_pot(scene, chosen.target)
+    gives_way, aside = _give_way_at_pot(scene, chosen.target)
     action = jnp.where(second & chosen.found & (chosen.number == pot_rule) & gives_way, aside, action)
     action = jnp.where(chosen.found, action, scene.wander())
     blocks, step = _blocking_step(scene)
@@ -192,7 +192,7 @@ def _step(scene: Scene, target: Int[Array, ""], cramped: Bool[Array, ""]) -> Int
     return jnp.where(cramped & (scene.destination(step) == scene.partner_cell), around, step)
 
 
-def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+def _give_way_at_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Return whether a partner with an ingredient is about as near to a pot as the agent, and a step to give way."""
     access = scene.single_access_cell(pot)
     as_near = scene.manhattan(scene.partner_cell, access) <= scene.manhattan(scene.own_cell, access) + 1
