@@ -111,7 +111,7 @@ def generate(
     """Generate a release, or resume an interrupted run.
 
     Trains the learned teammates of a profile, then generates histories of its tasks in OUT/artefacts, by egos that
-    learn (source ppo) and by scripts (sources noise and search). Packs the release into OUT/lite or OUT/full.
+    learn (source `ppo`) and by scripts (sources `noise` and `search`). Packs the release into OUT/lite or OUT/full.
     Unfinished work resumes from its last save. OUT/failed.jsonl lists the tasks that fail: the other tasks are
     finished, but nothing is packed and the exit code is 1.
     """
@@ -262,7 +262,7 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
     """Write the package's manifests with sampled teammates.
 
     Writes TRACK_validation.jsonl, TRACK_diverse_train.jsonl and TRACK_diverse_validation.jsonl with the teammates that
-    `draws` sampled and measured, and the manifests of the track preference. An existing file with other tasks is only
+    `draws` sampled and measured, and the manifests of the track `preference`. An existing file with other tasks is only
     replaced with --overwrite. TRACK_test.jsonl contains the published tasks, and this command does not write it.
     """
     from icrl4aht_generation.teammates.draws import diverse_tasks, validation_tasks

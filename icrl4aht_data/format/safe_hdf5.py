@@ -51,14 +51,14 @@ def find_node(group: Any, path: str) -> Any:
     """Return the group or dataset at a path relative to a group; None if the path does not exist.
 
     Raises:
-        ValueError: if a link on the path may point outside the file.
+        ValueError: if an HDF5 link on the path may lead to another file.
     """
     for part in path.strip("/").split("/"):
         name = part.encode()
         if part in ("", ".") or not isinstance(group, h5py.Group) or not group.id.links.exists(name):
             return None
         if group.id.links.get_info(name).type != h5l.TYPE_HARD:
-            raise ValueError(f"{path}: expected a hard link, found a link that may point outside the file")
+            raise ValueError(f"{path}: expected a hard link, found an HDF5 link that may lead to another file")
         group = group[part]
     return group
 

@@ -53,7 +53,7 @@ class _Slot(NamedTuple):
 
 
 class CellWords:
-    """All contents that a visible cell can have on one or several layouts; `cell_words` returns a cached instance.
+    """Vocabulary of observations: a word is a possible content of a visible cell. `cell_words` caches instances.
 
     Attributes:
         layouts: layouts whose observations have the same channels.

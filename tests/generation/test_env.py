@@ -247,7 +247,7 @@ def random_inputs(layout: Layout, size: int) -> tuple[np.ndarray, np.ndarray, np
 
 @pytest.fixture(scope="module")
 def jitted_rules() -> jax.stages.Wrapped:
-    """Return a compiled function that steps the rules of any layout and observes the state before the step."""
+    """Return a compiled function that observes a state of any layout and then computes one step."""
     return jax.jit(lambda tables, *inputs: (*rules.step(tables, *inputs), observe_both(tables, inputs[0])))
 
 

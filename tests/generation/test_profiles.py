@@ -52,7 +52,7 @@ def changed(tmp_path) -> Callable[[str, str], str]:
     return write
 
 
-# Profile teach is left out, since its tasks are also tasks of profile billion.
+# Profile `teach` is left out, since its tasks are also tasks of profile `billion`.
 @pytest.mark.parametrize("name", sorted({*profile_names()} - {"teach"}))
 def test_shipped_profiles_list_valid_tasks(name):
     profile = load_profile(name)

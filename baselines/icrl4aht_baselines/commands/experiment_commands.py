@@ -107,7 +107,7 @@ def control_command(out: Path) -> None:
 def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None:
     """Measure the reference egos on every test task.
 
-    The ego `stay` also plays the validation tasks, since scores are relative to its returns. Under the protocol seeded,
+    The ego `stay` also plays the validation tasks, since scores are relative to its returns. Under protocol `seeded`,
     each task is played with the seeds 0, 1 and 2. Writes all results into OUT, their summaries into OUT/headroom.json,
     OUT/headroom.md and OUT/stay.json, and groups of test teammates that behave the same into OUT/behaviours.json.
     """
@@ -249,8 +249,8 @@ def adaptation_headroom_command(
 def proof_command(root: Any, histories: tuple[str, ...], learner: tuple[str, ...], seeds: int, out: Path) -> _Queued:
     """Show what models learn from a release.
 
-    Trains small AD and DPT models on the release only, and evaluates them on validation tasks. On the track preference
-    each model also plays with its memory cleared before each episode. On the track teammate the models are compared
+    Trains small AD and DPT models on the release only, and evaluates them on validation tasks. On track `preference`
+    each model also plays with its memory cleared before each episode. On track `teammate` the models are compared
     with rl2-reference. Training a model takes about 35 minutes on one core. Writes OUT/proof.json, which the release's
     card shows. Finished runs are reused, and stopped runs resume.
     """

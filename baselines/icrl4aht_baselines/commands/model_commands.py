@@ -83,8 +83,8 @@ def collect_command(
 ) -> None:
     """Record histories of an agent with a release's teammates.
 
-    Writes a release of source agent. Its expert actions are the choices of the agent before noise is added, or those of
-    --labeller. Its oracle actions are the scripted oracle's choices; they are left out where the release states that
+    Writes a release of source `agent`. Its expert actions are the choices of the agent before noise is added, or those
+    of --labeller. Its oracle actions are the scripted oracle's choices; they are left out where the release states that
     the oracle's return is lower than the return at the end of the histories. Histories with validation teammates are
     recorded as well.
     """

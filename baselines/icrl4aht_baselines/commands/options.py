@@ -49,8 +49,8 @@ protocol_option = click.option(
     "--protocol",
     type=PROTOCOL_NAME,
     default="seeded",
-    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers. The protocol swap "
-    "is seeded, with another teammate every 25 episodes.",
+    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers. Protocol `swap` is "
+    "seeded, with another teammate every 25 episodes.",
 )
 greedy_option = click.option(
     "--greedy/--sampled",

@@ -108,7 +108,7 @@ def format_checks(checks: list[ControlCheck]) -> str:
 def dpt_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
     """Compare the regret of DPT with that of Thompson sampling, which DPT approximates (Lee et al. 2023)."""
     rng, method = np.random.default_rng(0), dpt(BANDIT_MODEL, worlds.bandit().world, finished_episodes_only=False)
-    rows = [worlds.dpt_rows(count, size.bandit_steps, rng) for count in (size.rows, 256)]
+    rows = [worlds.dpt_bandit_batch(count, size.bandit_steps, rng) for count in (size.rows, 256)]
     state = _train(method, rows, size, 0, folder, done)
     return _bandit_checks("DPT", ("Thompson sampling", worlds.thompson), method, state, size, rng)
 
@@ -118,7 +118,7 @@ def ad_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[C
     rng, method, rows = np.random.default_rng(1), ad(BANDIT_MODEL, worlds.bandit().world), []
     for count in (size.rows, 256):
         played = worlds.play_bandits(worlds.ucb, rng.random((count, worlds.ARMS)), size.bandit_steps, rng)
-        rows.append(worlds.ad_rows(np.ones((*played[0].shape, 1), np.uint8), *played, 0))
+        rows.append(worlds.ad_batch_of_histories(np.ones((*played[0].shape, 1), np.uint8), *played, 0))
     state = _train(method, rows, size, 1, folder, done)
     return _bandit_checks("AD", ("UCB", worlds.ucb), method, state, size, rng)
 
@@ -160,7 +160,7 @@ def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list
 
     def make_histories(count: int, some: np.ndarray) -> Any:
         cells, actions, rewards = worlds.dark_room_histories(rng.choice(some, count), size.room_episodes, rng)
-        return worlds.ad_rows(worlds.CELL_OBS[cells], actions, rewards, small.episode)
+        return worlds.ad_batch_of_histories(worlds.CELL_OBS[cells], actions, rewards, small.episode)
 
     rows = [make_histories(size.rows, known), make_histories(512, held_out)]
     state = _train(method, rows, size, 2, folder, done)

@@ -211,7 +211,7 @@ def _distance(one: np.ndarray, two: np.ndarray) -> np.ndarray:
     return np.abs(_ROWS[one] - _ROWS[two]) + np.abs(_COLUMNS[one] - _COLUMNS[two])
 
 
-def ad_rows(obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, episode: int) -> ADBatch:
+def ad_batch_of_histories(obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, episode: int) -> ADBatch:
     """Return an AD batch in which each window is a complete history. The arguments are arrays of shape (N, T, ..)."""
     t = np.arange(actions.shape[1])
     dones = np.broadcast_to((t + 1) % episode == 0 if episode else t < 0, actions.shape)
@@ -219,7 +219,7 @@ def ad_rows(obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, episode: 
     return ADBatch(obs, before[0], before[1], actions, dones, np.ones(actions.shape, bool))
 
 
-def dpt_rows(tasks: int, context: int, rng: np.random.Generator) -> DPTBatch:
+def dpt_bandit_batch(tasks: int, context: int, rng: np.random.Generator) -> DPTBatch:
     """Return DPT's training batch on bandits: contexts of diverse policies, and the best arms (Lee et al. 2023).
 
     A policy is a mixture of a random policy and one fixed arm; the arm's share is sampled from 0, 0.1, .., 1.

@@ -16,7 +16,7 @@ from icrl4aht_baselines.methods.method import (
     Loss,
     Method,
     World,
-    change_if,
+    apply_if,
     cross_entropy,
     make_next_obs_head,
     make_tokenizer,
@@ -110,13 +110,14 @@ class StepModel(nn.Module):
                 states = trunk.apply(variables, tokens[:kept], context, method="start_after")
             return WindowMemory(tokens, jnp.int32(kept), states)
 
-        return change_if(memory.steps == context, drop_oldest, variables, memory)
+        return apply_if(memory.steps == context, drop_oldest, variables, memory)
 
 
 def dropped_steps(context: int) -> int:
     """Return how many steps an ego with a cached memory drops if its window of `context` steps is full: a fifth.
 
-    A full window then has at least 4/5 of the context, and on average 4 tokens are computed again for each step.
+    After a drop, the other 4/5 of the context are computed again: on average 4 tokens for each step. From then on the
+    window never has less than 4/5 of the context.
     """
     return max(1, context // 5)
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from icrl4aht_baselines.methods.method import (
     Method,
     World,
-    change_if,
+    apply_if,
     cross_entropy,
     make_next_obs_head,
     make_tokenizer,
@@ -134,7 +134,7 @@ class DPT(nn.Module):
             return trunk.apply(variables, window, context + 1, method="start_after")
 
         changed = done if self.finished_episodes_only else jnp.bool_(True)
-        seen = change_if(changed, compute_context, (variables, tokens, complete), memory.context)
+        seen = apply_if(changed, compute_context, (variables, tokens, complete), memory.context)
         # The query takes the slot after the last transition, where the next query will overwrite it.
         feature, seen = self.trunk.advance(query, seen._replace(written=jnp.minimum(complete, context)))
         return self.head(feature), DPTMemory(tokens, written, complete, seen, obs, jnp.bool_(True))

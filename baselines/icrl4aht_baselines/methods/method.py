@@ -168,7 +168,7 @@ def run_model(model: nn.Module, options: ModelOptions, params: Any, key: Any, *i
     return model.apply({"params": params}, *inputs, **named, deterministic=key is None, rngs=rngs)
 
 
-def change_if(
+def apply_if(
     condition: Bool[Array, ""], change: Callable[[Any, Changed], Changed], params: Any, memory: Changed
 ) -> Changed:
     """Return `change(params, memory)` if the condition holds, otherwise `memory`.

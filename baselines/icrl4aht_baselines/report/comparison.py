@@ -300,7 +300,7 @@ def _controlled_cells(cells: AgentReturns, scales: CellScales) -> list[ResultCel
 
 
 def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, str]:
-    """Return agent -> text with its score N on each track and its benefit M of memory; a dash for missing values."""
+    """Return agent -> text with its score N on each track and the benefit M of its memory; a dash if missing."""
     scales, results, controls = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), stored.returns("cleared")
     found = {}
     for agent in agents:

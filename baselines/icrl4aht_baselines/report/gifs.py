@@ -123,7 +123,9 @@ def _draw_result(run: EvaluationRun, cell: ResultCell, prefix: Path, suite: Path
     try:
         paths = {number: prefix.with_name(f"{prefix.name}-{number}.gif") for number in (1, protocol.episodes)}
         if source.detail("swapped"):
-            raise OptionError("the control swapped has no GIFs, because another teammate played the earlier episodes")
+            raise OptionError(
+                "results with swapped teammates have no GIFs, because another teammate played the earlier episodes"
+            )
         ego, forget = restore_ego(source), bool(source.detail("forget"))
         shown = save_episodes(paths, task, ego, protocol, seed=seed, cell=24, suite=suite, forget=forget)
         return EpisodePair(cell, title, origin, shown)

@@ -75,7 +75,7 @@ class PlayOptions:
     four_recipes: Annotated[
         bool,
         Option(
-            "Also play on each layout with the four recipes of the protocol published, with teammates of one family."
+            "Also play on each layout with the four recipes of the protocol `published`, with teammates of one family."
         ),
     ] = False
 

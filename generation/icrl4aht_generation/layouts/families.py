@@ -105,7 +105,7 @@ def _named_layouts(family: str, seed: int) -> Iterator[Layout]:
 def split_of(layout: Layout) -> str:
     """Return the split of a layout, "train", "validation" or "test", from a hash of its `canonical_map`.
 
-    Layouts with the rooms of a published test layout, see `published_rooms`, are never in the split train.
+    Layouts with the rooms of a published test layout, see `published_rooms`, are never in the split `train`.
     """
     splits = [split for split in LAYOUT_SPLITS if split != "train" or not has_tested_rooms(layout)]
     digest = hashlib.sha256("\n".join(canonical_map(layout)).encode()).digest()

@@ -1,10 +1,10 @@
 """Heuristic teammates that differ widely from each other and from all test instances.
 
-`spread.jsonl` has one line for each training layout with teammates that `icrl4aht-data research draws --spread` chose
-and measured, so tasks need no simulation. The candidates are presets, specialists for one part of the work, a teammate
-that never acts, diverse sampled teammates of all families, and mixtures of these with random actions. Among candidates
-that behave differently from the test instances, the next chosen teammate is always the candidate that is farthest from
-all chosen teammates, until no candidate is far enough.
+`spread.jsonl` has one line for each training layout: the teammates that `icrl4aht-data research draws --spread` chose,
+with measured distances and returns, so tasks can be planned without simulation. The candidates are presets, specialists
+for one part of the work, a teammate that never acts, diverse sampled teammates of all families, and mixtures of these
+with random actions. Among candidates that behave differently from the test instances, the next chosen teammate is
+always the candidate that is farthest from all chosen teammates, until no candidate is far enough.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import optax
 import pytest
 from icrl4aht_baselines.agents.host import EgoInput
 from icrl4aht_baselines.methods import attention
-from icrl4aht_baselines.methods.method import Method, change_if
+from icrl4aht_baselines.methods.method import Method, apply_if
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.methods.tokens import Transition, batch_steps, batch_transitions, input_step, plain_view
@@ -363,7 +363,7 @@ def test_full_cached_window_drops_a_fifth_of_its_steps():
 
 
 class TestChangeIf:
-    """`change_if` computes a change only if the condition of at least one row of the batch is true."""
+    """`apply_if` computes a change only if the condition of at least one row of the batch is true."""
 
     CONDITION = jnp.array([True, False, True])
 
@@ -372,7 +372,7 @@ class TestChangeIf:
         return {"a": memory["a"] * params["scale"], "b": memory["b"] + params["add"]}
 
     def change_row(self, condition, add, memory):
-        return change_if(condition, self.change, {"scale": jnp.float32(3), "add": add}, memory)
+        return apply_if(condition, self.change, {"scale": jnp.float32(3), "add": add}, memory)
 
     def test_rows_change_only_if_their_condition_is_true(self):
         add, memory = jnp.array([10, 20, 30]), {"a": jnp.arange(6.0).reshape(3, 2), "b": jnp.arange(3)}
@@ -394,7 +394,7 @@ class TestChangeIf:
             return memory
 
         for condition in (jnp.zeros(3, bool), self.CONDITION):
-            jax.block_until_ready(jax.vmap(lambda c: change_if(c, count_call, (), jnp.float32(0)))(condition))
+            jax.block_until_ready(jax.vmap(lambda c: apply_if(c, count_call, (), jnp.float32(0)))(condition))
             jax.effects_barrier()
             assert bool(calls) == bool(condition.any())
 

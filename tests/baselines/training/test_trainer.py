@@ -276,7 +276,7 @@ class TestHeldOut:
         assert about["histories"]["teammates_split"] == "validation"
         assert {cell["split"] for cell in about["trained_on"]} == {"train"}
         assert {cell["source"] for cell in about["trained_on"]} == {"ppo", "noise"}
-        # The release has no PPO histories in split validation.
+        # The release has no PPO histories in split `validation`.
         learned = training_job(two_sources[0], source=("ppo",)).about
         assert learned["histories"]["sizes"] == {"train": 3, "histories": 1, "teammates": 4}
         assert learned["histories"]["teammates_split"] == "train"

@@ -122,7 +122,7 @@ def test_teammate_policy_acts_after_the_given_actions_end():
     assert set(teammate[50:]) - {4}
 
 
-def test_recovering_random_keys_of_histories_from_unknown_code_raises_error(lite):
+def test_random_keys_of_histories_without_known_code_version_cannot_be_recovered(lite):
     dataset = load_icrl4aht(lite[0])
     with pytest.raises(NotStoredError, match=r"use dataset\.reset_options"):
         recorded_draws(dataset, 0)
