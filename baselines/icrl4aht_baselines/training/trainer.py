@@ -246,11 +246,13 @@ class TrainingTask(NamedTuple):
 
         Raises:
             OptionError: if the folder has a run with other settings or another number of XLA threads (which changes the
-                results), or if the library of a logger is not installed.
+                results), a batch is larger than the free memory, or the library of a logger is not installed.
             BusyError: if another process trains in the folder.
             TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training with identical results.
         """
         check_loggers(log_to)
+        if self.data.train is not None:
+            self.data.train.empty()  # a batch larger than the free memory is refused before any file is written
         options, trainer = self.options, self.trainer or Trainer(self.method, self.options)
         config = {**format_versions(), "method": self.method.name, **self.about, "train": asdict(options)}
         with ExitStack() as stack:

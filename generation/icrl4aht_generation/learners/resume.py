@@ -275,7 +275,7 @@ class Checkpoints:
         """
         step = self.latest
         if step is None:
-            raise OptionError(f"{self.folder}: no checkpoint yet; continue the training with the same command")
+            raise OptionError(f"{self.folder}: expected a checkpoint, found none; train until one is saved")
         return self.state_file(step).load(like, part), step
 
 

@@ -95,5 +95,5 @@ class TestInvalidRuns:
         with pytest.raises(OptionError, match="does not describe a run on learning histories: KeyError"):
             find_agent(copied_run("other", model={}, histories={}))
         shutil.rmtree(Path(copied_run("early")) / "checkpoints")
-        with pytest.raises(OptionError, match="no checkpoint yet; continue the training"):
+        with pytest.raises(OptionError, match="expected a checkpoint, found none; train until"):
             find_agent(str(tmp_path / "early"))

@@ -193,7 +193,7 @@ class TestStateFile:
 def test_only_the_latest_checkpoints_are_kept(tmp_path):
     checkpoints = Checkpoints(tmp_path / "checkpoints", SETTINGS, keep=2)
     assert checkpoints.latest is None
-    with pytest.raises(OptionError, match="no checkpoint yet"):
+    with pytest.raises(OptionError, match="expected a checkpoint, found none"):
         checkpoints.load({})
     for step in (5, 10, 100):
         checkpoints.save({"step": jnp.int32(step)}, step)
