@@ -49,7 +49,7 @@ from icrl4aht_generation.teammates.instances import published_tasks
 from jax.extend.backend import get_backend
 
 from benchmarks.bench_learn import ad_method, heuristic_learner
-from benchmarks.harness import compile_measured, elapsed, print_line
+from benchmarks.harness import compile_and_measure, elapsed, print_line
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -162,7 +162,7 @@ def measure_learner(sizes: Sizes, encoder: EncoderKind) -> dict[str, Any]:
     learner = ego_learner(sizes, encoder)
     config = learner.config
     state = jax.jit(learner.init)(jax.random.key(0))
-    program = compile_measured(compiled_update(learner), state, xla_gpu_deterministic_ops=True)
+    program = compile_and_measure(compiled_update(learner), state, xla_gpu_deterministic_ops=True)
 
     def update() -> Any:
         nonlocal state
@@ -205,7 +205,7 @@ def _measure_training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype
     state = trainer.init()
     with trainer.batches(dataset.ad(batch_size=sizes.batch, length=length, seed=0), 0, sys.maxsize) as batches:
         batch = next(batches)
-        program = compile_measured(trainer.step, state, batch)
+        program = compile_and_measure(trainer.step, state, batch)
         limit = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", program.bytes)
         if program.bytes > limit:
             raise MemoryError(f"a batch in {parts} parts needs {gib(program.bytes)} GiB, expected at most {gib(limit)}")

@@ -84,7 +84,7 @@ class MeasuredProgram(NamedTuple):
     bytes: int
 
 
-def compile_measured(function: Any, *arguments: Any, **options: Any) -> MeasuredProgram:
+def compile_and_measure(function: Any, *arguments: Any, **options: Any) -> MeasuredProgram:
     """Compile a jitted function for given arguments and XLA options, and measure its costs."""
     started = time.perf_counter()
     traced = function.trace(*arguments)

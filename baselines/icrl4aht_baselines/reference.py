@@ -21,6 +21,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from msgspec import to_builtins
@@ -31,8 +32,17 @@ from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
 from icrl4aht_baselines.online.agent_histories import collect_release, release_teammates
 from icrl4aht_baselines.online.prepare import prepare_play
-from icrl4aht_baselines.report.page import instances_range, markdown_sections
-from icrl4aht_baselines.report.results import EvaluationRun, ResultSource, evaluate_agent, merge, read_run
+from icrl4aht_baselines.report.page import instances_range, summary_lines
+from icrl4aht_baselines.report.results import (
+    EPISODE_BLOCKS,
+    EvaluationRun,
+    ResultSource,
+    evaluate_agent,
+    mean_over_cells,
+    merge,
+    read_run,
+)
+from icrl4aht_baselines.report.scores import cell_scales
 from icrl4aht_baselines.training.histories import load_initial_params, prepare
 from icrl4aht_baselines.training.job import TrainingJob
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
@@ -44,7 +54,7 @@ from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import process_lock
 from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.utils.templates import fill_template
+from icrl4aht_data.utils.templates import fill_template, markdown_table
 from icrl4aht_data.writing.combine import combine_releases
 
 RL2_HISTORIES = NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8))
@@ -213,7 +223,7 @@ class ReferenceJob(TrainingJob):
 
     @property
     def steps_per_update(self) -> int:
-        """Number of environment or history steps of a training step, approximate if the model plays."""
+        """Number of environment steps, or steps of histories, in a training step; approximate if the model plays."""
         played = PlayOptions(**self.recipe.play).episodes * KEPT_STEPS
         return self.training.batch_size * (played if self.recipe.plays else self.training.context)
 
@@ -363,7 +373,6 @@ def write_bundled_card(name: str, jobs: Sequence[ReferenceJob], folder: Path = M
         f"| created with | icrl4aht-data {config['package_version']} |",
         f"| made by | `{command}` |",
     ]
-    sections = [section for one in (run, *validation) for section in markdown_sections([one], one.protocol)]
     drawn = [job.track for job in jobs if (folder / name / job.track / RUN_CURVES).is_file()]
     shown = [f"Training of the model of {format_track(track)}:\n\n![curves]({track}/{RUN_CURVES})" for track in drawn]
     text = fill_template(
@@ -374,7 +383,8 @@ def write_bundled_card(name: str, jobs: Sequence[ReferenceJob], folder: Path = M
         properties="\n".join(properties),
         models="\n".join(_model_row(run, sources) for sources in models.values()),
         protocol=run.protocol,
-        results="\n\n".join(f"#{section}" for section in sections),
+        summaries="\n".join(f"* {line}" for line in summary_lines([run, *validation])),
+        results=_layout_table(run),
         curves="\n\n".join(["## Curves", *shown, ""]) if shown else "",
         limits="\n".join(f"* {limit}" for limit in limits),
     )
@@ -403,6 +413,20 @@ def training_sentence(config: Mapping[str, Any]) -> str:
     named = f" of source {' and '.join(f'`{source}`' for source in sources)}" if sources else ""
     targets = f", with {' and '.join(f'`{label}`' for label in labels)} labels" if labels else ""
     return f"It was trained on learning histories{named}{targets}."
+
+
+def _layout_table(run: EvaluationRun) -> str:
+    """Return the card's table of results: mean returns over the result cells of each kind of tasks and layout."""
+    scales, body = cell_scales(run.protocol), []
+    blocks = [name for name in EPISODE_BLOCKS if all(name in of.blocks for of in run.returns.values())]
+    columns = ["tasks", "layout", *blocks, "`stay`", "best response"]
+    for (kind, layout), cells in grouped(run.returns, lambda cell: (cell.kind, cell.layout)).items():
+        known = [scales[cell] for cell in cells if cell in scales]
+        means = [mean_over_cells(run.returns[cell].blocks[name] for cell in cells) for name in blocks]
+        if len(known) == len(cells):
+            means += [float(np.mean(ends)) for ends in zip(*((of.stay, of.best) for of in known), strict=True)]
+        body.append([kind, layout, *(f"{mean:z.1f}" for mean in means), *["–"] * (len(columns) - 2 - len(means))])
+    return markdown_table(columns, body, right=len(columns) - 2)
 
 
 def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:

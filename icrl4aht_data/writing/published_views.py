@@ -30,7 +30,7 @@ def has_missing_rows(layout: Layout, obs_shape: tuple[int, ...]) -> bool:
 
 
 def views_without_items(layout: Layout) -> np.ndarray:
-    """Return observations without items from each cell that the ego can reach, uint8 of shape (cells, 5, 5, C)."""
+    """Return the view from each cell that the ego can reach, without any items, uint8 of shape (cells, 5, 5, C)."""
     records = np.zeros((len(layout.rooms[EGO]), record_size(layout)), np.uint8)
     records[:, columns(layout).positions] = layout.rooms[EGO][:, None]
     return np.asarray(observe(layout, records, EGO))

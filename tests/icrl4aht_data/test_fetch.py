@@ -41,7 +41,16 @@ from tests.helpers.batches import assert_equal_batches
 from tests.helpers.commands import run_cli
 from tests.helpers.damages import file_contents, flip_bit
 from tests.helpers.random_releases import SHARD
-from tests.servers.faults import CutBody, ErrorStatus, Fault, FlippedByte, LongBody, Redirect, ShortBody, SlowAnswer
+from tests.servers.faults import (
+    ErrorStatus,
+    Fault,
+    FlippedByte,
+    LongBody,
+    Redirect,
+    ShortBody,
+    SlowAnswer,
+    TruncatedBody,
+)
 from tests.servers.http import Answer, Server, http_server
 from tests.servers.hub import Hub, hub_server
 from tests.servers.process import hub_environment, hub_settings
@@ -265,7 +274,7 @@ WRONG: dict[str, tuple[Fault, str]] = {
     "absent": (ErrorStatus(404), "no such file"),
     "forbidden": (ErrorStatus(403), "403"),
     "busy for ever": (ErrorStatus(503), "503"),
-    "cut for ever": (CutBody(1000), "Error"),
+    "cut for ever": (TruncatedBody(1000), "Error"),
 }
 
 
@@ -297,7 +306,7 @@ def test_permanent_server_errors_are_raised_with_the_file_name(kind, fault, lite
 
 @pytest.mark.parametrize(
     "fault",
-    [ErrorStatus(503), ErrorStatus(429, {"Retry-After": "1"}), ErrorStatus(500), CutBody(1000), CutBody(0)],
+    [ErrorStatus(503), ErrorStatus(429, {"Retry-After": "1"}), ErrorStatus(500), TruncatedBody(1000), TruncatedBody(0)],
     ids=str,
 )
 @pytest.mark.parametrize("kind", ["http", "hub"])

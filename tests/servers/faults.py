@@ -33,7 +33,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class CutBody:
+class TruncatedBody:
     """Send correct headers and the first `after` bytes of the body, then close the connection."""
 
     after: int = 0
@@ -83,7 +83,7 @@ class Redirect:
     to: str
 
 
-Fault = CutBody | ErrorStatus | SlowAnswer | ShortBody | LongBody | FlippedByte | Redirect
+Fault = TruncatedBody | ErrorStatus | SlowAnswer | ShortBody | LongBody | FlippedByte | Redirect
 Rule = Callable[[Request], Fault | None]
 
 

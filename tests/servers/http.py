@@ -16,7 +16,6 @@ from typing import Any, BinaryIO, cast
 from urllib.parse import unquote, urlsplit
 
 from tests.servers.faults import (
-    CutBody,
     ErrorStatus,
     Fault,
     Faults,
@@ -26,6 +25,7 @@ from tests.servers.faults import (
     Request,
     ShortBody,
     SlowAnswer,
+    TruncatedBody,
 )
 
 BLOCK = 1 << 16
@@ -150,8 +150,8 @@ class Handler(BaseHTTPRequestHandler):
         pace = fault.bytes_per_second if isinstance(fault, SlowAnswer) else None
         most = BLOCK if pace is None else max(1, int(pace * PACE))
         flipped = fault.position % length if isinstance(fault, FlippedByte) and length else -1
-        end = min(length, fault.after) if isinstance(fault, CutBody) else length
-        self.close_connection |= isinstance(fault, CutBody)
+        end = min(length, fault.after) if isinstance(fault, TruncatedBody) else length
+        self.close_connection |= isinstance(fault, TruncatedBody)
         while request.sent < end:
             count = min(most, end - request.sent)
             block = bytearray(file.read(count).ljust(count, b"\0"))

@@ -29,7 +29,7 @@ DARK_ROOM_MODEL = replace(BANDIT_MODEL, width=64, heads=4)
 
 
 @dataclass(frozen=True)
-class ControlSize:
+class ControlExperiment:
     """Sizes of the positive control; the defaults take about ten minutes on two cores.
 
     Attributes:
@@ -76,7 +76,7 @@ class ControlCheck(NamedTuple):
         return self.value <= self.limit if self.quantity.endswith("at most") else self.value >= self.limit
 
 
-def run_control(folder: Path, show: Callable[..., None], size: ControlSize | None = None) -> list[ControlCheck]:
+def run_control(folder: Path, show: Callable[..., None], size: ControlExperiment | None = None) -> list[ControlCheck]:
     """Train and evaluate the three models of the positive control, and return the checks.
 
     A stopped run of the same size is resumed.
@@ -84,9 +84,9 @@ def run_control(folder: Path, show: Callable[..., None], size: ControlSize | Non
     Args:
         folder: folder of the training runs.
         show: function of `progress_bars` that shows the progress of a training run.
-        size: sizes of the control; by default those of `ControlSize`.
+        size: sizes of the control; by default those of `ControlExperiment`.
     """
-    size = size or ControlSize()
+    size = size or ControlExperiment()
     parts = (dpt_on_bandits, ad_on_bandits, ad_in_dark_room)
     return [
         check
@@ -105,7 +105,7 @@ def format_checks(checks: list[ControlCheck]) -> str:
     return "\n".join(lines)
 
 
-def dpt_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
+def dpt_on_bandits(folder: Path, size: ControlExperiment, done: StepProgress) -> list[ControlCheck]:
     """Compare the regret of DPT with that of Thompson sampling, which DPT approximates (Lee et al. 2023)."""
     rng, method = np.random.default_rng(0), dpt(BANDIT_MODEL, worlds.bandit().world, finished_episodes_only=False)
     rows = [worlds.dpt_bandit_batch(count, size.bandit_steps, rng) for count in (size.rows, 256)]
@@ -113,7 +113,7 @@ def dpt_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[
     return _bandit_checks("DPT", ("Thompson sampling", worlds.thompson), method, state, size, rng)
 
 
-def ad_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
+def ad_on_bandits(folder: Path, size: ControlExperiment, done: StepProgress) -> list[ControlCheck]:
     """Compare the regret of AD with that of its source algorithm, upper confidence bounds."""
     rng, method, rows = np.random.default_rng(1), ad(BANDIT_MODEL, worlds.bandit().world), []
     for count in (size.rows, 256):
@@ -128,7 +128,7 @@ def _bandit_checks(
     rival: tuple[str, worlds.BanditAlgorithm],
     method: Method,
     state: TrainState,
-    size: ControlSize,
+    size: ControlExperiment,
     rng: np.random.Generator,
 ) -> list[ControlCheck]:
     means = rng.random((size.tasks, worlds.ARMS))
@@ -151,7 +151,7 @@ def _bandit_checks(
     ]
 
 
-def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
+def ad_in_dark_room(folder: Path, size: ControlExperiment, done: StepProgress) -> list[ControlCheck]:
     """Measure how AD's return rises over the episodes of a Dark Room task, on goals held out from training."""
     rng, small = np.random.default_rng(2), worlds.dark_room()
     goals = np.delete(np.arange(worlds.CELLS), worlds.MIDDLE)
@@ -188,9 +188,9 @@ def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list
 
 
 def _train(
-    method: Method, rows: list[Any], size: ControlSize, number: int, folder: Path, done: StepProgress
+    method: Method, rows: list[Any], size: ControlExperiment, number: int, folder: Path, done: StepProgress
 ) -> TrainState:
-    """Train on the first data set in `rows`, validate on the second; `number` is an index of `ControlSize.updates`."""
+    """Train on the first data set in `rows` and validate on the second, for `size.updates[number]` steps."""
     updates = size.updates[number]
     options = TrainOptions(
         steps=updates,

@@ -330,7 +330,7 @@ def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"])
 
 
 def _model_policy(method: Method, changes: bool) -> Policy:
-    """Return the policy that samples the model's actions in training, with changed views if `changes` is set."""
+    """Return the policy that samples the model's actions in training; `changes` alter the observations."""
 
     def init(params: Any, key: Array) -> PlayerMemory:
         return PlayerMemory(no_change(), method.start(0, True), jnp.bool_(False))

@@ -84,7 +84,7 @@ class StoredResults:
         return {agent: returns_by_cell(found[agent]) for agent in [*self.agents] if agent in found}
 
     def with_other_play_modes(self, results: Mapping[str, AgentReturns]) -> dict[str, AgentReturns]:
-        """Return `results`, with those of an agent's other play mode, such as "rl2 (greedy)", after the agent's own."""
+        """Return `results` so that an agent's other way to act, such as "rl2 (greedy)", follows the agent."""
         others, found = {way: self.returns(way) for way in OTHER_WAYS}, {}
         for agent, own in results.items():
             found[agent] = own

@@ -295,7 +295,7 @@ def common_results(one: CellReturns, other: CellReturns) -> tuple[CellReturns, C
 
 
 def scored_cells(run: EvaluationRun, cells: Iterable[ResultCell], scales: CellScales) -> list[ResultCell]:
-    """Return the cells with headroom that a run played completely, with episodes of the benchmark's length."""
+    """Return the result cells with headroom in which a run played all tasks, in episodes of full length."""
     return [cell for cell in cells if run.has_full_length(cell) and is_scored(run.returns[cell], scales.get(cell))]
 
 

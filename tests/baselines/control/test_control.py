@@ -11,7 +11,7 @@ from icrl4aht_generation.policy import Policy
 
 from tests.helpers.commands import run_cli
 
-TINY = control.ControlSize(bandit_steps=4, room_episodes=2, rows=64, tasks=4, updates=(2, 2, 2), batch_size=4)
+TINY = control.ControlExperiment(bandit_steps=4, room_episodes=2, rows=64, tasks=4, updates=(2, 2, 2), batch_size=4)
 
 
 def constant_policy(action: int) -> Policy:

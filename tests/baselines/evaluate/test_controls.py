@@ -86,7 +86,7 @@ def test_memory_and_partner_controls_equal_hand_computed_differences(solo_return
     plain = np.array([[stays[0, 0], *wanders[0, 1:]], stays[1]])
     np.testing.assert_array_equal([result.returns[0] for result in found.plain], plain)
     np.testing.assert_array_equal([result.returns[0] for result in found.cleared], stays)
-    # Task 0: the teammate of task 1 plays first, the ego earns reward, and stays when its own teammate plays.
+    # In task 0, the ego earns reward with the teammate of task 1, and then never moves with its own teammate.
     # Task 1: the teammate of task 0 plays first, the ego earns nothing, and acts randomly when its own teammate plays.
     swapped = np.array([result.returns[0] for result in found.swapped])
     np.testing.assert_array_equal(swapped[:, 2:], [stays[0, 2:], wanders[1, 2:]])

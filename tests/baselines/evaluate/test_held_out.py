@@ -28,7 +28,7 @@ from tests.servers.http import http_server
 
 @pytest.fixture
 def suite(tmp_path) -> Path:
-    """Write a suite of teammates with one untrained policy that is held out on cramped_up."""
+    """Write a suite with one untrained policy on layout cramped_up, which is kept out of training."""
     root, layout = tmp_path / "suite", get_layout("cramped_up")
     network, where = ActorCritic(Widths((4,), (4,), 8, 8, 8)), "cramped_up/fcp/m0/c0"
     shapes = jax.eval_shape(lambda: network.untrained(jax.random.key(0), layout.channels))

@@ -220,7 +220,7 @@ class TestRunFolder:
 class TestTrainingStep:
     @pytest.mark.slow
     def test_accumulated_gradient_equals_gradient_of_complete_batch(self):
-        """The mean over two micro-batches with unequal padding is the gradient of the complete batch."""
+        """The mean gradient of two micro-batches with unequal padding is the gradient of the complete batch."""
         method = get_method("ad")(dataclasses.replace(MODEL, dropout=0.0), FLAT)
         one, parts = (Trainer(method, dataclasses.replace(OPTIONS, accumulate=n)) for n in (1, 2))
         batch = TinySampler().batch(0)

@@ -16,21 +16,21 @@ from tests.helpers.random_releases import write_long_index
 
 
 @pytest.fixture(scope="module")
-def long_release(tmp_path_factory) -> tuple[Path, list[Entry]]:
+def release_with_long_histories(tmp_path_factory) -> tuple[Path, list[Entry]]:
     root = tmp_path_factory.mktemp("long") / "release"
     return root, write_long_index(root)
 
 
-def test_index_entries_equal_the_written_lines(long_release):
-    index = read_index(long_release[0])
-    assert list(index.entries) == long_release[1]
-    assert index.entries[-1] == long_release[1][-1]
+def test_index_entries_equal_the_written_lines(release_with_long_histories):
+    index = read_index(release_with_long_histories[0])
+    assert list(index.entries) == release_with_long_histories[1]
+    assert index.entries[-1] == release_with_long_histories[1][-1]
 
 
 @pytest.fixture
-def read_changed_index(long_release, tmp_path) -> Callable[[Callable[[list[str]], str]], Index]:
+def read_changed_index(release_with_long_histories, tmp_path) -> Callable[[Callable[[list[str]], str]], Index]:
     """Return a function that changes the lines of a long index and reads the changed index."""
-    shutil.copytree(long_release[0] / "meta", tmp_path / "meta")
+    shutil.copytree(release_with_long_histories[0] / "meta", tmp_path / "meta")
     path = tmp_path / "meta" / "histories.jsonl"
     lines = path.read_text().splitlines()
 
@@ -52,8 +52,8 @@ def read_changed_index(long_release, tmp_path) -> Callable[[Callable[[list[str]]
     ],
     ids=["compact", "no last newline", "spaces"],
 )
-def test_index_lines_may_differ_in_json_formatting(long_release, read_changed_index, change):
-    assert list(read_changed_index(change).entries) == long_release[1]
+def test_index_lines_may_differ_in_json_formatting(release_with_long_histories, read_changed_index, change):
+    assert list(read_changed_index(change).entries) == release_with_long_histories[1]
 
 
 @pytest.mark.parametrize(
@@ -72,8 +72,8 @@ def test_index_line_that_is_not_one_json_object_raises_error(read_changed_index,
         read_changed_index(lambda lines: "".join(f"{line}\n" for line in change(lines)))
 
 
-def test_index_queries_match_a_scan_of_all_entries(long_release):
-    root, entries = long_release
+def test_index_queries_match_a_scan_of_all_entries(release_with_long_histories):
+    root, entries = release_with_long_histories
     index = read_index(root)
     for wanted in (
         {},
