@@ -27,11 +27,11 @@ from icrl4aht_data.overcooked.drawing import AGENT_COLOURS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import faults
 from icrl4aht_data.reading.history import History
-from icrl4aht_data.utils.files import write_atomically
+from icrl4aht_data.utils.files import PAGE_START, write_atomically
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_histories
 
-PAGE_START = b'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>ICRL4AHT histories</title>'
+BROWSER_PAGE_START = PAGE_START + b"histories</title>"
 """First bytes of a page; an output file that starts with them may be replaced."""
 
 PAGE_HISTORIES = 30

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -14,9 +13,9 @@ from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.browsing.page import (
+    BROWSER_PAGE_START,
     PAGE_HISTORIES,
     PAGE_MEGABYTES,
-    PAGE_START,
     make_browser_page,
     save_browser_page,
     varied_history_ids,
@@ -53,7 +52,7 @@ from icrl4aht_data.format.schema import ALL_KINDS, OBSERVATIONS
 from icrl4aht_data.plotting import PICTURES, plot_learning_curves
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
-from icrl4aht_data.utils.files import check_output
+from icrl4aht_data.utils.files import check_output, starts_with
 from icrl4aht_data.utils.progress import bar_updater, progress_bars
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 from icrl4aht_data.writing.combine import combine_releases
@@ -191,9 +190,8 @@ def browse(
     all episodes fit, the page has some episodes of each history, including the first and the last, and says which. A
     release of observations cannot be shown, since it has no states to draw.
     """
-    with suppress(OSError), out.open("rb") as stream:  # a page written by `browse` is replaced even without --overwrite
-        overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
-    check_output(out, overwrite)
+    # A page that `browse` wrote is replaced even without --overwrite.
+    check_output(out, overwrite or (out.is_file() and starts_with(out, BROWSER_PAGE_START)))
     matching = load_icrl4aht(root, **filters)
     chosen = matching.select(list(dict.fromkeys(wanted)) or varied_history_ids(matching, histories))
     with progress_bars(quiet) as show:

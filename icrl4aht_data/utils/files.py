@@ -30,6 +30,20 @@ LARGEST = 4 * 2**30
 LINE_BYTES = 2**20
 """Maximum bytes of a line of a text file."""
 
+PAGE_START = b'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>ICRL4AHT '
+"""First bytes of the HTML pages that `browse` and `report` write."""
+
+_STARTS = {
+    ".gif": b"GIF8",
+    ".htm": PAGE_START,
+    ".html": PAGE_START,
+    ".json": b'{"format":',
+    ".parquet": b"PAR1",
+    ".pdf": b"%PDF-",
+    ".png": b"\x89PNG\r\n",
+    ".svg": b"<?xml",
+}  # first bytes of the files that commands write, by suffix
+
 _DEPTH = 64  # maximum nesting of JSON, well below the depth of Python's stack
 
 
@@ -224,7 +238,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None) -> None:
     """Check that a command may write a file, or files into a folder.
 
-    Folders and links are never replaced.
+    Folders, links, and files of another kind than their suffix says are never replaced.
 
     Args:
         path: the file to write; with `names`, the folder.
@@ -232,8 +246,8 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
         names: names of the files to write into the folder.
 
     Raises:
-        OptionError: if a file exists or the folder is not empty, and `overwrite` is False; or if a folder or link has
-            the path of a file.
+        OptionError: if a file exists or the folder is not empty, and `overwrite` is False; or if a folder, a link or
+            a file of another kind has the path of a file.
     """
     if names is not None and os.path.lexists(path):
         if not path.is_dir():
@@ -245,6 +259,16 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
             raise OptionError(f"{file}: expected a file, found a folder or a link; give another name")
         if file.exists() and not overwrite:
             raise OptionError(f"{file}: exists; give another name, or use --overwrite to replace it")
+        start = _STARTS.get(file.suffix, b"")
+        if file.exists() and not starts_with(file, start):
+            wrong = f"{file}: not a {file.suffix} file that this package writes"
+            raise OptionError(f"{wrong}, so it is not replaced; give another name, or remove it")
+
+
+def starts_with(path: Path, start: bytes) -> bool:
+    """Return whether a file starts with the given bytes."""
+    with path.open("rb") as stream:
+        return stream.read(len(start)) == start
 
 
 def check_folder_content(folder: Path, names: Collection[str], what: str) -> None:

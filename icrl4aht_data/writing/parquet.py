@@ -29,16 +29,18 @@ def to_parquet(dataset: Dataset, path: str | Path, *, overwrite: bool = False) -
 
     Args:
         dataset: a release, or a selection of its histories.
-        path: path of the file to write.
-        overwrite: whether to replace a file at `path`.
+        path: path of the file to write, which ends in .parquet.
+        overwrite: whether to replace a Parquet file at `path`.
 
     Raises:
-        OptionError: if pyarrow is not installed, or if `path` may not be written, see `utils.files.check_output`, or
-            is inside the release.
+        OptionError: if pyarrow is not installed, or if `path` has another suffix, is inside the release, or may not be
+            written, see `utils.files.check_output`.
     """
     arrow, path = import_pyarrow(), as_path(path)
     import pyarrow.parquet as pq
 
+    if path.suffix != ".parquet":
+        raise OptionError(f"{path}: expected a name that ends in .parquet; give such a name")
     check_output(path, overwrite)
     if path.resolve().is_relative_to(dataset.root.resolve()):
         raise OptionError(f"{path} is inside the release {dataset.root}; give a path outside of it")

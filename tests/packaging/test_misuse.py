@@ -81,7 +81,8 @@ list empty | empty: no release here, expected the file meta/info.json; give the 
 verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
 list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
 convert {MINI} --out file/x --to lite | file: File exists; expected a folder, found a file
-convert {MINI} --out none/index --to parquet | none/index: No such file or directory; check the path;
+convert {MINI} --out index.csv --to parquet | index.csv: expected a name that ends in .parquet
+convert {MINI} --out none/index.parquet --to parquet | none/index.parquet: No such file or directory; check the path;
 combine --out out {MINI} --data-version banana | data version 'banana': expected a SemVer version such as 1.0.0
 research diversity --suite empty | empty: no layout has all its populations finished; train
 train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release

@@ -147,10 +147,11 @@ def report_command(
     check_output(folder, overwrite, page.REPORT_FILES)
     if html:
         check_output(html, overwrite)
-    paths = page.write_report(loaded, folder)
-    if html:
+    pages = []
+    if html:  # written first, since drawing takes minutes: a stopped command leaves no report that blocks the next one
         with progress_bars() as show:
-            paths.append(page.write_page(loaded, html, gifs=gifs, suite=suite, progress=show))
+            pages = [page.write_page(loaded, html, gifs=gifs, suite=suite, progress=show)]
+    paths = [*page.write_report(loaded, folder), *pages]
     click.echo(paths[0].read_text(encoding="utf-8"))
     for path in paths:
         click.echo(f"wrote {path}")

@@ -236,8 +236,8 @@ def write_report(runs: Sequence[EvaluationRun], out: Path) -> list[Path]:
     """Write report.md and report.csv of some runs into the folder `out`. Return the paths of both files."""
     out.mkdir(parents=True, exist_ok=True)
     text, table = paths = [out / name for name in REPORT_FILES]
-    text.write_text(markdown(runs), encoding="utf-8")
-    table.write_text(csv_text(runs), encoding="utf-8")
+    write_atomically(text, markdown(runs))
+    write_atomically(table, csv_text(runs))
     return paths
 
 
@@ -314,7 +314,7 @@ def write_page(
         values = _page_values(runs, episodes, notes if shown and left else [])
         text = _template_environment().get_template("page.html").render(values)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, text)
+    write_atomically(path, text.lstrip())  # `check_output` knows a page by its first bytes
     return path
 
 

@@ -7,6 +7,7 @@ import json
 import re
 from html import unescape
 from html.parser import HTMLParser
+from unittest.mock import Mock
 
 import pytest
 from icrl4aht_baselines.agents.bundled import MODELS
@@ -217,7 +218,11 @@ def test_evaluate_and_report_commands_write_results_tables_and_page(tmp_path, mo
         "measured."
     )
     assert summary in printed and f"2 results in {tmp_path / 'run'}, 1 program compiled" in printed
-    printed = run_cli("report", tmp_path / "run", "--html", tmp_path / "report.html")
+    report = ["report", tmp_path / "run", "--html", tmp_path / "report.html"]
+    with monkeypatch.context() as stopped:
+        stopped.setattr(page, "family_gifs", Mock(side_effect=KeyboardInterrupt))
+        run_cli(*report, code=1)
+    printed = run_cli(*report)  # not refused, since the stopped command left no files
     assert f"* {summary}" in printed
     assert "| H4 | stay | 0.0<br>1 of 5 instances<br>episodes 1: 0.0, 2-5: 0.0<br>no headroom |" in printed
     assert {path.name for path in (tmp_path / "run" / "report").iterdir()} == {"report.md", "report.csv"}
@@ -229,7 +234,7 @@ def test_evaluate_and_report_commands_write_results_tables_and_page(tmp_path, mo
     assert captions == ["Episode 1: return 0", "Episode 3: return 0"] * 2
     with pytest.raises(OptionError, match="report: exists"):
         run_cli("report", tmp_path / "run")
-    run_cli("report", tmp_path / "run", "--overwrite")
+    run_cli(*report, "--no-gifs", "--overwrite")
     (tmp_path / "run" / "tasks.jsonl").unlink()
     with pytest.raises(OptionError, match=r"is neither a published test task, .* nor in the results' tasks\.jsonl"):
         run_cli("report", tmp_path / "run")

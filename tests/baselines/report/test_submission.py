@@ -107,6 +107,7 @@ def test_submit_and_results_commands_write_file_and_page(submission_file, tmp_pa
     said = ["--about", "a rule", "--data", "none", "--labels", "none", "--core-hours", "1.5", "--name", "my rule"]
     printed = run_cli("submit", folder, *said, "--out", tmp_path / "mine.json")
     assert "mine.json: my rule, layout;" in printed
+    assert run_cli("submit", folder, *said, "--out", tmp_path / "mine.json", "--overwrite") == printed
     assert read_submission(tmp_path / "mine.json").facts.core_hours == 1.5
     assert json.loads(run_cli("submit", "--schema"))["$defs"]["AgentFacts"]
     page = ["results", str(submission_file), str(tmp_path / "mine.json"), "--out", str(tmp_path / "page")]

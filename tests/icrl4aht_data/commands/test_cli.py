@@ -113,6 +113,9 @@ def test_show_plot_writes_a_figure_of_learning_curves(lite, tmp_path):
 
     run_cli("show", lite[0], "--plot", tmp_path / "curves.png")
     assert [path.name for path in tmp_path.iterdir()] == ["curves.png"]
+    for suffix in (".png", ".svg", ".pdf"):
+        for _ in range(2):  # a picture is replaced by a picture
+            run_cli("show", lite[0], "--plot", tmp_path / f"curves{suffix}", "--overwrite")
     picture = imread(tmp_path / "curves.png")
     assert picture.shape[0] > 200
     assert len({tuple(pixel) for pixel in picture[::7, ::7].reshape(-1, picture.shape[-1])}) > 5
@@ -123,7 +126,7 @@ def test_commands_do_not_overwrite_existing_data(lite, full, tmp_path):
     shutil.copytree(full[0], tmp_path / "cb")
     shutil.copytree(lite[0], tmp_path / "ca")
     (tmp_path / "mine").mkdir()
-    for name in ("thesis.txt", "index.parquet", "curves.png"):
+    for name in ("thesis.txt", "index.parquet", "curves.png", "page.html"):
         (tmp_path / "mine" / name).write_text("years")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     ca, cb, mine = (str(tmp_path / name) for name in ("ca", "cb", "mine"))
@@ -135,9 +138,14 @@ def test_commands_do_not_overwrite_existing_data(lite, full, tmp_path):
         *(("release", "build", ca, "--out", target) for target in (ca, cb, mine)),
         *(("convert", ca, "--to", form, "--out", cb) for form in ("full", "published", "parquet")),
         *(("convert", ca, "--to", form, "--out", mine, "--overwrite") for form in ("full", "published", "parquet")),
-        ("convert", ca, "--to", "parquet", "--out", f"{mine}/index.parquet"),
+        *(
+            ("convert", ca, "--to", "parquet", "--out", f"{mine}/index.parquet", *more)
+            for more in ((), ("--overwrite",))
+        ),
+        ("convert", ca, "--to", "parquet", "--out", f"{mine}/page.html", "--overwrite"),
         ("convert", ca, "--to", "parquet", "--out", f"{ca}/index.parquet"),
-        ("show", ca, "--plot", f"{mine}/curves.png"),
+        *(("show", ca, "--plot", f"{mine}/curves.png", *more) for more in ((), ("--overwrite",))),
+        *(("browse", ca, "--out", f"{mine}/page.html", *more) for more in ((), ("--overwrite",))),
     ]
     commands.remove(("combine", ca, "--out", cb, "--overwrite"))  # `--overwrite` may replace the release `cb`
     for command in commands:

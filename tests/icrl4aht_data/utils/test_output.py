@@ -1,4 +1,4 @@
-"""Test `check_output`: existing files are replaced only on request; links and folders are never replaced."""
+"""Test `check_output`: files are replaced only on request and by files of their kind; links and folders never."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from icrl4aht_data.utils.files import check_output
 def test_check_output_allows_replacing_files_only_on_request(tmp_path):
     path = tmp_path / "file.png"
     check_output(path, overwrite=False)
-    path.write_bytes(b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n")
     check_output(path, overwrite=True)
     with pytest.raises(OptionError, match=r"file\.png: exists; give another name, or use --overwrite to replace it"):
         check_output(path, overwrite=False)
@@ -21,6 +21,17 @@ def test_check_output_allows_replacing_files_only_on_request(tmp_path):
     for name in ("link", "lost", "folder"):
         with pytest.raises(OptionError, match=f"{name}.png: expected a file, found a folder or a link"):
             check_output(tmp_path / f"{name}.png", overwrite=True)
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".html", ".htm", ".json", ".parquet", ".pdf", ".png", ".svg"])
+def test_check_output_never_replaces_files_of_another_kind(tmp_path, suffix):
+    path = tmp_path / f"mine{suffix}"
+    for content in (b"", b"<!doctype html>\n<title>mine</title>", b"{}\n"):
+        path.write_bytes(content)
+        with pytest.raises(
+            OptionError, match=rf"mine\{suffix}: not a \{suffix} file .* give another name, or remove it"
+        ):
+            check_output(path, overwrite=True)
 
 
 def test_check_output_checks_the_named_files_of_a_folder(tmp_path):
