@@ -179,9 +179,10 @@ def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
     except (TypeError, ValueError) as error:
         raise OptionError(f"weights: expected numbers, found {weights!r}") from error
     if numbers.shape != (histories,) or not np.isfinite(numbers).all() or (numbers < 0).any() or not numbers.any():
+        values = f"{numbers.min():g} to {numbers.max():g}" if numbers.size else "no values"
         raise OptionError(
             f"weights: expected {histories} numbers, one per history, none negative and not all zero; found shape "
-            f"{numbers.shape} with {numbers.min(initial=0):g}..{numbers.max(initial=0):g}"
+            f"{numbers.shape} with {values}"
         )
     return numbers
 
