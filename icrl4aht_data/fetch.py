@@ -3,6 +3,10 @@
 The files of a remote release are stored in a local folder. For `hf://`, this is the snapshot in the Hub's cache, which
 other tools share; for any other address, a folder in `system.data_folder`, one per version. A file is accepted only if
 its SHA-256 is the one in the manifest, so an interrupted download is resumed file by file.
+
+In the Hub's cache, the Hub's client gives a file its final name before this check. If the process is killed in between,
+wrong bytes of the right size stay, but are not used: the hashes of all files except shards are compared again, the
+chunks of shards are checked whenever they are read, and `icrl4aht-data download` replaces changed files.
 """
 
 from __future__ import annotations
@@ -171,7 +175,8 @@ class Remote(ReleaseLocation):
         address, target = f"{self.url}/{name}", self.path(name)
         if scratch is None:
             _remove_from_cache(target)  # otherwise the client would keep the cached file
-        most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else disk.LARGEST
+        most = disk.TEXT_BYTES if name.endswith(".json") else disk.LARGEST
+        most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else most
         path = _fetch_with_retries(self.client, address, name, scratch, advance, most)
         size, found = path.stat().st_size, disk.file_hash(path)
         if found != self.manifest[name]:

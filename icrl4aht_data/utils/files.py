@@ -24,8 +24,8 @@ from icrl4aht_data.errors import DiskFullError, IndexFormatError, OptionError, U
 TEXT_BYTES = 64 * 2**20
 """Maximum bytes of a text file: six times our largest text file, the provenance of ten thousand tasks."""
 
-LARGEST = 4 * 2**30
-"""Maximum bytes of a file of a release, except shards."""
+LARGEST = 2**30
+"""Maximum bytes of a file of a release, except shards; an index of this size has 1.5 million histories."""
 
 LINE_BYTES = 2**20
 """Maximum bytes of a line of a text file."""

@@ -31,12 +31,14 @@ from icrl4aht_data.errors import (
     OptionError,
     RemoteError,
     RootNotFoundError,
+    ShardCorruptError,
     UnknownNameError,
 )
 from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
+from icrl4aht_data.utils import files as disk
 from tests.helpers.batches import assert_equal_batches
 from tests.helpers.commands import run_cli
 from tests.helpers.damages import file_contents, flip_bit
@@ -396,6 +398,32 @@ def test_changed_cached_file_is_fetched_again(kind, name, lite):
         path.resolve().write_bytes(path.read_bytes()[:-5])
         assert_equal_batches(load_batch(url, "coord_simple"), load_batch(lite[0], "coord_simple"))
         assert path.read_bytes() == (lite[0] / name).read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["http", "hub"])
+def test_shard_with_wrong_bytes_of_the_right_size_is_not_used(kind, lite):
+    """A download that is killed before its check can leave such a shard in the Hub's cache."""
+    with serve_release(kind, lite[0]) as (url, _):
+        plan = plan_download(url)
+        fetch_planned(plan)
+        path = plan.root.folder / SHARD
+        path.resolve().write_bytes(bytes(255 - byte for byte in path.read_bytes()))
+        with pytest.raises(ShardCorruptError, match=f"{SHARD}: .* `icrl4aht-data download` replaces it"):
+            load_batch(url, "coord_simple")
+        plan = plan_download(url)
+        assert plan.changed == [SHARD]
+        fetch_planned(plan)
+        assert path.read_bytes() == (lite[0] / SHARD).read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["http", "hub"])
+def test_endless_metadata_stops_at_a_limit(kind, lite, monkeypatch):
+    monkeypatch.setattr(disk, "TEXT_BYTES", 100_000)
+    with serve_release(kind, lite[0]) as (url, server):
+        assert server is not None
+        server.faults.next(LongBody(3_000_000), times=ALWAYS, path=f"*{INFO}")
+        with pytest.raises(RemoteError, match=f"{INFO}: expected at most 100,000 bytes, but the server sent more"):
+            load_icrl4aht(url)
 
 
 @pytest.mark.parametrize("kind", ["http", "hub"])

@@ -125,4 +125,4 @@ def test_verify_reports_a_terabyte_shard_within_20_seconds(release_copy, with_in
 def test_verify_reports_a_terabyte_readme(release_copy):
     os.truncate(release_copy / "README.md", 10**12)
     found = problems(release_copy, "quick")
-    assert any("README.md: expected at most 4,294,967,296 bytes, found 1,000,000,000,000" in line for line in found)
+    assert any("README.md: expected at most 1,073,741,824 bytes, found 1,000,000,000,000" in line for line in found)
