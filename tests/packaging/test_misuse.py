@@ -70,6 +70,7 @@ evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 evaluate --agent empty --out e | empty: expected a run folder, but config.json is missing
 evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
 evaluate --agent stay --out e --split train | unknown split 'train'; valid: test, validation
+evaluate --agent stay --out e --seed 1 --seeds 2 | --seed: cannot be used with --seeds; leave one of them out
 evaluate --agent stay --out e --manifest {MINI}/meta/tasks.jsonl --split test | --manifest: cannot be used with --split
 watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
 train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
@@ -79,6 +80,8 @@ FAILED = """
 list none | none: no release here, expected the file meta/info.json; give the folder of a release
 list empty | empty: no release here, expected the file meta/info.json; give the folder of a release
 verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
+list --split test | no history has split=['test']. This release has split train, validation; layout coord_simple,
+list --split test | others; teammate_family H
 list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
 convert {MINI} --out file/x --to lite | file: File exists; expected a folder, found a file
 convert {MINI} --out index.csv --to parquet | index.csv: expected a name that ends in .parquet

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from contextlib import nullcontext
+from unittest.mock import Mock, call
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 from icrl4aht_baselines.agents.egos import random, stay
 from icrl4aht_baselines.agents.host import EgoInput, from_host
+from icrl4aht_baselines.evaluate import evaluator
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
 from icrl4aht_baselines.evaluate.protocols import (
     PROTOCOLS,
@@ -56,7 +59,7 @@ def test_returns_of_a_task_do_not_depend_on_other_tasks_in_batch(batch_returns):
     }
 
 
-def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_returns, tmp_path):
+def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_returns, tmp_path, monkeypatch):
     first = evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
     started, played = [], []
 
@@ -66,6 +69,10 @@ def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_retu
 
     again = evaluate("random", log_and_make_ego, SIMPLE + RING, PUBLISHED, out=tmp_path, played=played.append)
     assert returns_by_task(again) == batch_returns
+    shown = Mock()
+    monkeypatch.setattr(evaluator, "progress_bars", lambda quiet, unit: nullcontext(None if quiet else shown))
+    evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
+    assert shown.call_args == call("random, published", 5 * 4, 5 * 4)  # a bar is shown unless `played` is given
     assert played == [5 * 4, 5, 5, 5, 5]  # stored tasks are reported in one call, other tasks after each episode
     assert started == ["coord_ring"]
     assert len(list((tmp_path / "tasks").iterdir())) == 10

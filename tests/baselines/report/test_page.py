@@ -210,7 +210,18 @@ def test_evaluate_and_report_commands_write_results_tables_and_page(tmp_path, mo
     own = make_task("teammate", "train", "demo_wide", tests[0].teammate | {"theta_id": 77}, 5)
     write_tasks(tmp_path / "tasks.jsonl", [*tests[:2], own])
     monkeypatch.setitem(PROTOCOLS, "published", dataclasses.replace(PROTOCOLS["published"], steps=5))
-    options = ["--protocol", "published", "--manifest", tmp_path / "tasks.jsonl", "--tasks", "1", "--episodes", "3"]
+    options = [
+        "--protocol",
+        "published",
+        "--manifest",
+        tmp_path / "tasks.jsonl",
+        "--tasks",
+        "1",
+        "--episodes",
+        "3",
+        "--seed",
+        "4",
+    ]
     played = ["evaluate", "--agent", "stay", *options, "--out", tmp_path / "run"]
     printed = run_cli(*played)
     summary = (
@@ -229,7 +240,7 @@ def test_evaluate_and_report_commands_write_results_tables_and_page(tmp_path, mo
     text = (tmp_path / "report.html").read_text()
     assert PageElements(text).images.count("data:image/gif") == 4
     assert "<h4>stay with H4/t77 (training) on demo_wide</h4>" in text
-    assert f"Task {own.task_id}, protocol published, seed 0." in text
+    assert f"Task {own.task_id}, protocol published, seed 4." in text
     captions = re.findall(r"<figcaption>(Episode [^<]+)<", text)
     assert captions == ["Episode 1: return 0", "Episode 3: return 0"] * 2
     with pytest.raises(OptionError, match="report: exists"):

@@ -71,6 +71,7 @@ WRONG_CALLS: dict[str, Any] = {
     "sampler = 7: expected a sampler": lambda ds: hf_windows(7),  # type: ignore[arg-type]
     "rows = 'abc': expected rows of episodes": lambda ds: render_observations("abc"),  # type: ignore[arg-type]
     "expected fps from 1 to 50, found 'fast'": lambda ds: ds[0].animate(fps="fast"),
+    "expected cell from 16 to 128 pixels, found 1000000": lambda ds: ds[0].animate(cell=10**6),
 }
 
 
