@@ -10,7 +10,7 @@ One JSON line is printed for each case, with the error if the case fails. At the
 line for each case without a result. Learners use XLA's deterministic operations, as in `generate`. Models are
 untrained.
 
-`mfu` is the model FLOP utilisation: matrix-product operations per second of a step, including the backward pass, see
+`mfu` is the model FLOP utilization: matrix-product operations per second of a step, including the backward pass, see
 `benchmarks.harness.product_flops`, divided by the speed of the large product with the same dtype. The encoder `words`
 computes equal observations of a batch once, but its operations are counted as if all observations differed.
 `program_gib` is the memory that the compiler planned for a program, `process_peak_gib` the process's peak memory since
@@ -82,7 +82,7 @@ class Sizes:
     seconds: float = 4.0
 
     def mfu(self, flops: float, seconds: float, dtype: str) -> float:
-        """Return the model FLOP utilisation: `flops / seconds` relative to the speed of the large product."""
+        """Return the model FLOP utilization: `flops / seconds` relative to the speed of the large product."""
         return round(flops / seconds / product_tflops(self.product, dtype, None, self.seconds / 4) / 1e12, 4)
 
 

@@ -133,7 +133,7 @@ class Sampler(Generic[B, D, T]):
         raise NotImplementedError
 
     def empty(self) -> B:
-        """Return a batch of uninitialised arrays to pass to `batch` as `out`: reusing memory is faster.
+        """Return a batch of uninitialized arrays to pass to `batch` as `out`: reusing memory is faster.
 
         Raises:
             OptionError: if an array is larger than the free memory.

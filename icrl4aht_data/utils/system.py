@@ -26,7 +26,7 @@ _CGROUP = Path("/sys/fs/cgroup")
 
 
 def new_array(shape: tuple[int, ...], dtype: DTypeLike, what: str) -> np.ndarray:
-    """Return an uninitialised array, if enough memory is free.
+    """Return an uninitialized array, if enough memory is free.
 
     Raises:
         OptionError: if too little memory is free; the message has the array's name and size.

@@ -18,7 +18,7 @@ PHONE = 390
 
 @contextmanager
 def chromium() -> Iterator[Callable[..., Any]]:
-    """Start a browser; yield a function that opens an address in a window of a given width and color scheme.
+    """Start a browser; yield a function that opens an address in a window of a given width and colour scheme.
 
     At the end, check that no page had an error and that no local page requested a file from a server.
     """

@@ -81,7 +81,7 @@ def _remove_times(notebook: Any) -> Any:
     for output in cell_outputs(notebook):
         output.get("metadata", {}).clear()
         if output["output_type"] == "stream":
-            output["text"] = re.sub(r"\x1b\[[0-9;]*m", "", output["text"])  # remove color codes
+            output["text"] = re.sub(r"\x1b\[[0-9;]*m", "", output["text"])  # remove colour codes
     notebook["metadata"] = {
         "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
         "language_info": {"name": "python"},

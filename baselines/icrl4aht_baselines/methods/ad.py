@@ -136,7 +136,7 @@ def step_method(name: str, label: str, model: StepModel, loss: Loss, world: Worl
 
 
 def example_step(world: World) -> StepInput:
-    """Return a `StepInput` of zeros with shape (1, 1), for the initialisation of parameters."""
+    """Return a `StepInput` of zeros with shape (1, 1), for the initialization of parameters."""
     zero = jnp.zeros((1, 1), jnp.int32)
     return StepInput(jnp.zeros((1, 1, *world.obs_shape)), zero, jnp.zeros((1, 1)), zero)
 

@@ -3,7 +3,7 @@
 As in AMAGO (Grigsby et al. 2024), actor and critics share the encoder, and there is one policy and one value for each
 of several discount factors; the ego acts with the last policy. Returns continue over episodes, so exploration that
 helps in later episodes is rewarded. The actor imitates the actions with a positive estimated advantage (filtered
-behaviour cloning), and maximises the expected value of its policy (Q term). The critics learn by one-step bootstrapping
+behaviour cloning), and maximizes the expected value of its policy (Q term). The critics learn by one-step bootstrapping
 from a slow copy of the parameters. The model does not observe how far the source algorithm's training had progressed.
 
 Shapes: `B` batch size, `L` length of a window, `G` discount factors, `A` actions, `D` width.
@@ -86,7 +86,7 @@ def amago_offline(options: ModelOptions, world: World) -> Method:
         error = jnp.square(jnp.sum(online.values * taken_BxLx1xA, axis=-1)[:, :, :-1] - bootstrap)
         critic = mean_of_rows(error.mean(axis=(0, -1)), mask[:, 1:])
 
-        # Actor: imitate actions with a value above the policy's expected value, and maximise that expected value.
+        # Actor: imitate actions with a value above the policy's expected value, and maximize that expected value.
         values_BxLxGxA = jax.lax.stop_gradient(online.values.min(axis=0))
         baseline_BxLxG = jnp.sum(policy_BxLxGxA * values_BxLxGxA, axis=-1)
         better = jnp.sum(values_BxLxGxA * taken_BxLx1xA, axis=-1) > jax.lax.stop_gradient(baseline_BxLxG)

@@ -63,7 +63,7 @@ def _attend(
 ) -> Float[Array, "B H R Dh"]:
     """Return the attention of a block of rows: row i attends to the first `seen` + i keys.
 
-    The softmax is normalised after the product with the values: R x Dh divisions instead of R x N.
+    The softmax is normalized after the product with the values: R x Dh divisions instead of R x N.
     """
     dtype = q_BxHxRxDh.dtype
     product: Any = partial(

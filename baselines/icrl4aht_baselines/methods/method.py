@@ -59,7 +59,7 @@ class Method:
         label: name in reports.
         data: training data: batches of the sampler "ad" or "dpt", or "tasks" for a method that learns by playing.
         model: module with the methods `start` and `act`.
-        example: example arguments of the model, to initialise its parameters with.
+        example: example arguments of the model, to initialize its parameters with.
         loss: loss function, see `Loss`.
         logits: function from the model's output to the policy's logits (*B, A).
         slow: step size of the slow copy of the parameters; 0 for a method without a slow copy.
@@ -77,7 +77,7 @@ class Method:
     takes_labels: bool = True
 
     def init(self, key: Array) -> Any:
-        """Return randomly initialised parameters, float32."""
+        """Return randomly initialized parameters, float32."""
         return jax.jit(self.model.init)(key, *self.example)["params"]
 
     def start(self, context: int, cached: bool) -> Any:

@@ -74,7 +74,7 @@ TASK_KINDS = {
     "diverse": "Validation tasks with diverse teammates, which vary in more than the published training ranges. Models "
     "are chosen by them, too.",
     "training": "Training tasks (split train): the teammates and layouts that models are made to be trained with. "
-    "Their returns do not show generalisation.",
+    "Their returns do not show generalization.",
     "held out": "Held-out tasks: learned teammates that a suite keeps out of its training tasks. Where an agent was "
     "trained with one of them or with others of their algorithm, its score is marked (paper, App. F).",
     PREFERENCE: "Tasks of the track preference, which is this project's own, not the paper's.",

@@ -1,4 +1,4 @@
-"""`mean_ad`: AD that summarises the past by its mean."""
+"""`mean_ad`: AD that summarizes the past by its mean."""
 
 import flax.linen as nn
 import jax.numpy as jnp

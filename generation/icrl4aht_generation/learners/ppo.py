@@ -159,7 +159,7 @@ class PPO:
         config, adam = self.config, ppo_optimizer(self.config)
         count = played.done.shape[1] - played.done.shape[1] % config.minibatches
         # Advantages and critic targets use the values from the rollout, so they do not change between epochs.
-        advantage = generalised_advantage(played.reward, played.value, played.done, played.last_value[0], config)
+        advantage = generalized_advantage(played.reward, played.value, played.done, played.last_value[0], config)
         batch = Batch(played, advantage, advantage + played.value)
 
         def epoch(carry, key):
@@ -212,7 +212,7 @@ class Batch(NamedTuple):
 
     Attributes:
         played: sequences of a rollout.
-        advantage: float32 (T, M), generalised advantage estimates.
+        advantage: float32 (T, M), generalized advantage estimates.
         target: float32 (T, M), targets of the critic.
     """
 
@@ -221,14 +221,14 @@ class Batch(NamedTuple):
     target: Float[Array, "T M"]
 
 
-def generalised_advantage(
+def generalized_advantage(
     reward: Float[Array, "T M"],
     value: Float[Array, "T M"],
     done: Bool[Array, "T M"],
     last_value: Float[Array, " M"],
     config: PPOConfig,
 ) -> Float[Array, "T M"]:
-    """Return generalised advantage estimates (Schulman et al. 2016, eq. 16).
+    """Return generalized advantage estimates (Schulman et al. 2016, eq. 16).
 
     Neither the bootstrapped value nor the trace continues over the end of an episode.
     """

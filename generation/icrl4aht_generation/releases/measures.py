@@ -184,7 +184,7 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
     """Measure the returns with teammates of one layout, and the distances of learned teammates to the test teammates.
 
     Distances of heuristics such as presets are not measured, because this would take longer than generating a small
-    release. The card warns against claims of generalisation to new teammates of these families.
+    release. The card warns against claims of generalization to new teammates of these families.
     """
     learned = [task for task in tasks if task.teammate_family == "rl"]
     heuristics = [task for task in tasks if task.teammate_family != "rl"]

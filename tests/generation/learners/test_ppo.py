@@ -22,7 +22,7 @@ from icrl4aht_generation.learners.encoder import CompactView
 from icrl4aht_generation.learners.ppo import (
     Batch,
     Sequences,
-    generalised_advantage,
+    generalized_advantage,
     ppo_optimizer,
     sequences,
 )
@@ -138,7 +138,7 @@ def ego_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
 
 
 def plain_advantage(reward, value, done, last_value, gamma: float, lam: float) -> np.ndarray:
-    """Return generalised advantage estimates by a loop over environments and steps."""
+    """Return generalized advantage estimates by a loop over environments and steps."""
     out = np.zeros(reward.shape)
     for n in range(reward.shape[1]):
         trace, following = 0.0, last_value[n]
@@ -152,7 +152,7 @@ def plain_advantage(reward, value, done, last_value, gamma: float, lam: float) -
 
 
 @pytest.mark.parametrize(("gamma", "lam"), [(0.99, 0.95), (0.9, 0.0), (0.5, 1.0)])
-def test_generalised_advantage_equals_a_loop_over_steps(gamma, lam):
+def test_generalized_advantage_equals_a_loop_over_steps(gamma, lam):
     rng = np.random.default_rng(2)
     reward, value = rng.normal(size=(2, 20, 6)).astype(np.float32)
     done = rng.random((20, 6)) < 0.15
@@ -160,7 +160,7 @@ def test_generalised_advantage_equals_a_loop_over_steps(gamma, lam):
     done[-1, 1] = False
     last = rng.normal(size=6).astype(np.float32)
     config = replace(CONFIG, discount=gamma, gae_lambda=lam)
-    compute = jax.jit(generalised_advantage, static_argnums=4)
+    compute = jax.jit(generalized_advantage, static_argnums=4)
     found = compute(reward, value, done, last, config)
     np.testing.assert_allclose(found, plain_advantage(reward, value, done, last, gamma, lam), rtol=0, atol=1e-5)
 
@@ -208,8 +208,8 @@ def test_ppo_loss_equals_formulas_in_numpy(learner, played):
     ratio = np.exp(chosen - ego_choices(rollout).log_prob)
     change = value - ego_choices(rollout).value
     assert (np.abs(ratio - 1) > CONFIG.clip).any() and (np.abs(change) > CONFIG.clip).any()
-    normalised = (advantage - advantage.mean()) / advantage.std() * weight
-    policy = -np.minimum(ratio * normalised, np.clip(ratio, 0.8, 1.2) * normalised).mean()
+    normalized = (advantage - advantage.mean()) / advantage.std() * weight
+    policy = -np.minimum(ratio * normalized, np.clip(ratio, 0.8, 1.2) * normalized).mean()
     near = ego_choices(rollout).value + np.clip(change, -0.2, 0.2)
     value_loss = 0.5 * np.maximum((value - target) ** 2, (near - target) ** 2).mean()
     entropy = -(np.exp(log_probs) * log_probs).sum(axis=-1).mean()

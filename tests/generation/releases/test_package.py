@@ -80,18 +80,18 @@ def make_tasks(profile: Profile, count: int) -> list[Task]:
     return [first, *(make_task("teammate", "train", "demo_wide", entry, 7) for entry in entries[1:])]
 
 
-def package_tasks(tmp_path: Path, profile: Profile, works: Sequence[WorkUnit], facts: dict[str, TeammateFacts]) -> Path:
-    return package_release(tmp_path / "artefacts", tmp_path / "release", works, profile, tmp_path, "lite", facts)
+def package_tasks(tmp_path: Path, profile: Profile, units: Sequence[WorkUnit], facts: dict[str, TeammateFacts]) -> Path:
+    return package_release(tmp_path / "artefacts", tmp_path / "release", units, profile, tmp_path, "lite", facts)
 
 
 @pytest.fixture
 def two_learners(built, profile, tmp_path) -> list[WorkUnit]:
     """Return two learners of one task: 3 histories of the first and 1 history of the second improve by 5 or more."""
     (task,) = make_tasks(profile, 1)
-    works = [WorkUnit(task, "ppo", learner) for learner in range(2)]
-    make_learner(built, works[0], tmp_path / "artefacts", [10, 4, 20, 15], 5.0)
-    make_learner(built, works[1], tmp_path / "artefacts", [3, 25], 7.0)
-    return works
+    units = [WorkUnit(task, "ppo", learner) for learner in range(2)]
+    make_learner(built, units[0], tmp_path / "artefacts", [10, 4, 20, 15], 5.0)
+    make_learner(built, units[1], tmp_path / "artefacts", [3, 25], 7.0)
+    return units
 
 
 def test_improving_histories_of_both_learners_are_kept(two_learners, profile, tmp_path):
@@ -145,31 +145,31 @@ def test_minimum_improvement_is_not_required_without_headroom(two_learners, prof
 
 def test_tasks_without_improving_histories_or_headroom_are_left_out(built, two_learners, profile, tmp_path):
     flat = make_tasks(profile, 2)[1]
-    works = [*two_learners, *(WorkUnit(flat, "ppo", learner) for learner in range(2))]
-    for work in works[2:]:
+    units = [*two_learners, *(WorkUnit(flat, "ppo", learner) for learner in range(2))]
+    for work in units[2:]:
         make_learner(built, work, tmp_path / "artefacts", [4, 4], 0.0)
     strict = replace(profile, least_improvement=5.0)
     facts = {two_learners[0].task.task_id: MATTERS, flat.task_id: MATTERS}
-    root = package_tasks(tmp_path, strict, works, facts)
+    root = package_tasks(tmp_path, strict, units, facts)
     (left_out,) = read_info(root).left_out
     assert (left_out.task_id, left_out.teammate, left_out.source) == (flat.task_id, "H4/t1", "ppo")
     assert (left_out.learners, left_out.streams, left_out.return_start, left_out.return_end) == (2, 16, 0, 1)
     assert "no stream's end exceeds its start by 5" in left_out.reason
     assert {entry.task_id for entry in load_icrl4aht(root).entries} == {two_learners[0].task.task_id}
     assert verify_release(root).findings == []
-    (left_out,) = read_info(package_tasks(tmp_path, strict, works, facts | {flat.task_id: DOES_NOT})).left_out
+    (left_out,) = read_info(package_tasks(tmp_path, strict, units, facts | {flat.task_id: DOES_NOT})).left_out
     assert "no headroom: returns of these egos differ" in left_out.reason
     with pytest.raises(OptionError, match="no task has histories to keep: the learners did not learn"):
-        package_tasks(tmp_path, strict, works[2:], facts)
+        package_tasks(tmp_path, strict, units[2:], facts)
 
 
 def test_tasks_with_little_mean_improvement_are_left_out(built, two_learners, profile, tmp_path):
     """The kept histories of the first task improve by 17.5 on average, and those of the second task by 5.5."""
     flat = make_tasks(profile, 2)[1]
     make_learner(built, work := WorkUnit(flat, "ppo"), tmp_path / "artefacts", [4, 6, 3, 5], 5.0)
-    works, task_id = [*two_learners, work], two_learners[0].task.task_id
+    units, task_id = [*two_learners, work], two_learners[0].task.task_id
     rising = replace(profile, least_improvement=5.0, least_rise=17.0)
-    root = package_tasks(tmp_path, rising, works, {task_id: MATTERS, flat.task_id: MATTERS})
+    root = package_tasks(tmp_path, rising, units, {task_id: MATTERS, flat.task_id: MATTERS})
     (left_out,) = read_info(root).left_out
     assert (left_out.task_id, left_out.streams) == (flat.task_id, 8)
     assert left_out.reason == "its histories rise by 5.5 on average, expected 17"

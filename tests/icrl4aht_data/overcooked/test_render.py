@@ -38,7 +38,7 @@ def changed_cells(before: np.ndarray, after: np.ndarray, layout=COORD) -> set[in
 
 
 def dominant_share(pixels: np.ndarray, strong: int, weak: tuple[int, int], least: int = 80) -> float:
-    """Return the share of pixels in which one color channel exceeds the other two by more than `least`."""
+    """Return the share of pixels in which one colour channel exceeds the other two by more than `least`."""
     return float((pixels[..., strong] > pixels[..., list(weak)].max(axis=-1) + least).mean())
 
 
