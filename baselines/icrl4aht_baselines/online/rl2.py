@@ -303,6 +303,7 @@ def make_players(tasks: Sequence[PlayTask], method: Method, play: PlayOptions, m
 
     def program(task: PlayTask) -> tuple[Any, ...]:
         mate = task.teammate
+        # A teammate that sees a `Situation` gets the layout as data; the functions of other teammates need one layout.
         shared = (mate.init, mate.act) if mate.sees == "situation" else (task.layout,)
         return (task.family, task.searched, *shared)
 
@@ -393,6 +394,7 @@ class PlayTrainer:
             max_grad_norm=options.clip,
         )
         self.ppo = PPO(_Network(method.model), config)
+        # The old parameters and the old optimizer state are donated, because nothing uses them after an update.
         self._learn = jax.jit(self._learn_from, donate_argnums=(0, 1))
         self._compiled: list[Callable[..., Any]] = []
 

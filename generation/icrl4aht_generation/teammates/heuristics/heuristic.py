@@ -83,6 +83,7 @@ class Heuristic:
             slot: 0 or 1, the agent that the teammate plays.
             noise: source of the teammate's randomness.
         """
+        # Only teammates with random actions have the second chain of keys, which costs a draw in every step.
         init, act = _policy_functions(self, slot, noise, RANDOM_ACTIONS in theta)
         params = {
             name: (jnp.int32 if isinstance(default, int) else jnp.float32)(theta[name])
@@ -159,5 +160,7 @@ def draw(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, " 4"]]:
 
 def split_key_again(key: Key[Array, ""], where: Bool[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""]]:
     """Return a teammate's next random key, split once more if `where` is true, and a key for additional draws."""
+    # The published code draws these numbers in some states only. Selecting a key gives the same chain of keys without a
+    # branch, which `jax.vmap` would compute anyway.
     following, own = jax.random.split(key)
     return jnp.where(where, following, key), own
