@@ -17,7 +17,7 @@ from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, evalu
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, SUBMITTED_SEEDS
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
-from icrl4aht_data.utils.templates import markdown_table
+from icrl4aht_data.utils.text import markdown_table
 
 HEADROOM_FILES = ("headroom.json", "headroom.md", "stay.json", "behaviours.json")
 

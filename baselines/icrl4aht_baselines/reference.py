@@ -54,7 +54,7 @@ from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import process_lock
 from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.utils.templates import fill_template, markdown_table
+from icrl4aht_data.utils.text import fill_template, markdown_table
 from icrl4aht_data.writing.combine import combine_releases
 
 RL2_HISTORIES = NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8))

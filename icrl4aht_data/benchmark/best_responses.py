@@ -16,7 +16,7 @@ import msgspec
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import write_atomically
 from icrl4aht_data.utils.install_hints import RESTORE
-from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.utils.text import card_file
 
 
 class TrainingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

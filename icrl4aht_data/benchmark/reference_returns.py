@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 
 from icrl4aht_data.benchmark.facts import FAMILIES
-from icrl4aht_data.utils.templates import card_file, markdown_table
+from icrl4aht_data.utils.text import card_file, markdown_table
 
 REFERENCES = ("stay", "random", "oracle")
 """Names of the reference egos."""

@@ -20,7 +20,7 @@ from icrl4aht_data.plotting import plot_layouts, plot_learning_curves, save_figu
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
 from icrl4aht_data.utils.files import file_hash, files_below, write_json
 from icrl4aht_data.utils.install_hints import install_command
-from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.utils.text import card_file
 from icrl4aht_data.writing.card import CURVES_FIGURE, LAYOUTS_FIGURE, write_card
 from icrl4aht_data.writing.parquet import to_parquet, write_episodes
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder, check_target

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.schema import FIELDS, PARQUET_EPISODES, PARQUET_INDEX
 from icrl4aht_data.utils.install_hints import AUTHORS, import_optional, project_url
-from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.utils.text import card_file
 from icrl4aht_data.writing.card import card_texts, episode_texts, rai_texts
 
 if TYPE_CHECKING:

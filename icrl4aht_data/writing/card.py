@@ -54,8 +54,7 @@ from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.utils.files import files_below, write_json
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.install_hints import project_url
-from icrl4aht_data.utils.templates import card_file, markdown_table
-from icrl4aht_data.utils.text import counted_noun
+from icrl4aht_data.utils.text import card_file, counted_noun, markdown_table
 from icrl4aht_data.writing.proof import proof_table, read_proof
 
 HEADROOM_PROTOCOL = "published"

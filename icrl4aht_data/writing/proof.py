@@ -12,7 +12,7 @@ from typing import Any
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import HISTORIES
 from icrl4aht_data.utils.files import file_hash, parse_json, read_text
-from icrl4aht_data.utils.templates import card_file, markdown_table
+from icrl4aht_data.utils.text import card_file, markdown_table
 
 PROOF_FILE = "proof.json"
 

@@ -30,7 +30,7 @@ from icrl4aht_data.overcooked import state
 from icrl4aht_data.overcooked.channels import canonical_positions
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.utils.text import card_file
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.commands import run_cli
 from tests.helpers.damages import flip_bit

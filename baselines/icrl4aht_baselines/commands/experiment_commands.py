@@ -22,7 +22,7 @@ from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.utils.files import check_output, parse_json, read_text
 from icrl4aht_data.utils.options import replace_options
 from icrl4aht_data.utils.progress import progress_bars
-from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.utils.text import card_file
 from icrl4aht_data.writing.proof import PROOF_FILE, proof_table
 
 _STEPS = 8_000_000  # default environment steps to train each ego of `adaptation-headroom`

@@ -25,7 +25,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.utils.templates import markdown_table
+from icrl4aht_data.utils.text import markdown_table
 
 EGO_KINDS = ("informed", "episodic")
 

@@ -47,7 +47,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import unknown_name
 from icrl4aht_data.utils.files import json_hash, parse_json, read_text
 from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.utils.templates import markdown_table
+from icrl4aht_data.utils.text import markdown_table
 
 PROTOCOL = "seeded"
 """Protocol under which best responses are chosen and measured."""

@@ -46,7 +46,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import add_legend_below, axis_limits, save_figure
 from icrl4aht_data.reading.arrow_tables import import_pyarrow
 from icrl4aht_data.utils.files import atomic_write, write_json
-from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
+from icrl4aht_data.utils.text import card_file, fill_template, markdown_table
 
 RESULTS_FILES = ("results.md", "results.png", "results.csv", "results.parquet")
 

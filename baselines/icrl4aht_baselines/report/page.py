@@ -46,8 +46,7 @@ from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, over
 from icrl4aht_data.benchmark.facts import TRACKS, family_sort_key
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
 from icrl4aht_data.utils.files import json_hash, parse_json, read_text, write_atomically
-from icrl4aht_data.utils.templates import card_file, markdown_table
-from icrl4aht_data.utils.text import counted_noun
+from icrl4aht_data.utils.text import card_file, counted_noun, markdown_table
 
 REPORT_FILES = ("report.md", "report.csv")
 """Names of the files that `write_report` writes."""

@@ -18,7 +18,7 @@ from icrl4aht_generation.teammates.distances import common_records
 
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.utils.text import card_file
 from tests.helpers.paths import ROOT
 
 TINY = ResponseOptions(steps=400, tasks=4)

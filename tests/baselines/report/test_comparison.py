@@ -17,7 +17,7 @@ from msgspec import structs
 from icrl4aht_data.benchmark import best_responses
 from icrl4aht_data.benchmark.reference_returns import read_reference_returns
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.utils.text import card_file
 from tests.helpers.evaluated import write_results
 from tests.helpers.paths import ROOT
 

@@ -17,7 +17,7 @@ from icrl4aht_data.errors import OptionError, ReleaseError, UploadError
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
-from icrl4aht_data.utils.templates import card_file, fill_template
+from icrl4aht_data.utils.text import card_file, fill_template
 from tests.helpers.commands import run_cli
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import random_release
