@@ -47,5 +47,5 @@ VERBS = (
     Verb("release", "", "Publish", "Prepare a release for publication."),
     Verb("release build", f"{_CLI}:build", "Publish", "Build a release for publication."),
     Verb("upload", f"{_CLI}:upload", "Publish", "Upload a release to the Hugging Face Hub, and tag it."),
-    Verb("research", "", "Research", "Rebuild the bundled data, and repeat the paper's experiments."),
+    Verb("research", "", "Research", "Rebuild what the package bundles, and measure it."),
 )

@@ -162,6 +162,9 @@ def from_published(
 ) -> Kind:
     """Write a release from files of the published code.
 
+    The published names of teammates are translated: family `fcp` of kind `rl` becomes family `rl` of kind `fcp`. Views
+    of 4 x 5 cells on the cramped layouts are padded to 5 x 5.
+
     Args:
         source: a folder with `histories.h5`, `histories_index.jsonl` and the tasks of the index in `tasks.jsonl`.
             Without `tasks.jsonl`, the result can only be a release of observations, in which tasks have only names.

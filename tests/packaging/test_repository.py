@@ -76,6 +76,19 @@ def test_citation_has_the_version_of_the_package():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version("icrl4aht-data")
 
 
+def test_citation_has_the_release_date_of_the_changelog():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    heading = re.search(rf"^## {cited['version']}(?:, (\d.*))?$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert heading and str(cited.get("date-released")) == str(heading[1])
+
+
+def test_nightly_workflow_runs_the_image_that_it_builds():
+    job = yaml.safe_load((ROOT / ".github" / "workflows" / "nightly.yml").read_text())["jobs"]["image"]
+    _, build, run = (step.get("run", "") for step in job["steps"])
+    assert build == "docker build --tag icrl4aht-data ." and run == "docker run --rm icrl4aht-data"
+    assert (ROOT / "Dockerfile").read_text().endswith('CMD ["make", "demo"]\n')
+
+
 def test_repository_address_is_the_same_in_all_files():
     """README, citation and site must repeat the repository address of pyproject.toml, if pyproject.toml has one."""
     url = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"].get("Repository")

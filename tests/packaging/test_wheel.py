@@ -24,6 +24,8 @@ from icrl4aht_data import __version__
 from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.paths import PACKAGES as SOURCES
 from tests.helpers.paths import ROOT
+from tests.helpers.tiny import TINY
+from tests.packaging.test_readme import README, shell_calls
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 READER = "icrl4aht_data"
@@ -266,6 +268,29 @@ def test_training_and_drawing_need_only_the_extras_that_messages_name(jax_enviro
     run("icrl4aht-data", "report", "results")
     assert "demo_wide" in (tmp_path / "results" / "report" / "report.md").read_text(encoding="utf-8")
     assert (tmp_path / "results" / "report" / "report.csv").stat().st_size > 500
+
+
+QUICK_OPTIONS = {
+    "browse": "",
+    "train": "--steps 2 --batch-size 2 --context 20 --width 16 --heads 2",
+    "evaluate": "--tasks 1 --episodes 2",
+    "generate": "--profile tiny.toml",
+    "release": "",
+}
+"""Command of the README -> options that shorten it, given after the options that the README shows."""
+
+
+def test_the_five_commands_of_the_readme_run_after_its_install_command(wheel, tmp_path):
+    (extras,) = re.findall(r"^pip install '\.(\[.*?\])'", README, re.MULTILINE)
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    run = command_runner(make_environment(version, tmp_path / "env", f"{NAME}{extras} @ {wheel.as_uri()}"), tmp_path)
+    (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")
+    calls = shell_calls(README.partition("## Five commands")[2])
+    assert [arguments[0] for arguments in calls] == list(QUICK_OPTIONS)
+    for arguments in calls:
+        run("icrl4aht-data", *arguments, *QUICK_OPTIONS[arguments[0]].split())
+    for name in ("browse.html", "runs/ad/config.json", "runs/results/tasks", "build/smoke/lite", "build/release"):
+        assert (tmp_path / name).exists(), name
 
 
 def test_the_installed_size_is_limited(bare_environment, capsys):

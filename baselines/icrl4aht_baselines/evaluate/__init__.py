@@ -1,4 +1,13 @@
-"""Evaluation of egos on the benchmark's tasks, under named protocols."""
+"""Evaluation of egos on the benchmark's tasks, under named protocols.
+
+An evaluation writes these files into its folder OUT:
+
+* `OUT/tasks/<task_id>.json`, one for each finished task: `settings`, their hash, `returns` of each seed's episodes,
+  and, if teammates change, `partners`, the ids of their tasks.
+* `OUT/tasks.jsonl`: the tasks that are not published test tasks.
+* `OUT/run.json`: the training data of a model (`trained_on`), as in its run's `config.json`, with an entry for each
+  layout, split, family, algorithm, source and kind of labels.
+"""
 
 import sys
 

@@ -152,7 +152,8 @@ class Profile:
         noise: options of histories of the source "noise".
         search: options of histories of the source "search".
         scripted_layouts: options by source and layout, for layouts with other values than `noise` or `search`.
-        generated: number of sampled teammates by generated layout.
+        generated: number of sampled teammates by generated layout. TOML tables `[[tasks.generated]]` add generated
+            layouts, with `family`, `count`, `split` and `teammates`, the number of diverse teammates (default 0).
         preference: layouts of the source "search", which has the training and validation tasks of the track
             `preference` on these layouts.
         policies: whether the release contains the policies that label the histories.

@@ -78,7 +78,11 @@ class Assignment(NamedTuple):
 
 
 class Algorithm:
-    """Base class of population algorithms. An algorithm keeps its state, such as multipliers, in a pytree `memory`."""
+    """Base class of population algorithms. An algorithm keeps its state, such as multipliers, in a pytree `memory`.
+
+    Register the name of a new algorithm in `icrl4aht_data.benchmark.facts.ALGORITHMS`, and the algorithm in the module
+    `icrl4aht_generation.populations.train`.
+    """
 
     def assignment(self, environments: int) -> Assignment:
         """Return the assignment of policies to agents, with a given number of environments for each member."""
