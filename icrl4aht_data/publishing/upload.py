@@ -137,7 +137,11 @@ def _complete_plan(api: HfApi, plan: Upload, folder: Path, private: bool) -> Upl
 
 
 def _upload_and_tag(api: HfApi, plan: Upload, folder: Path) -> Upload:
-    """Upload the files of a plan, compare the repository with the release, and tag the commit."""
+    """Upload the files of a plan, compare the repository with the release, and tag the commit.
+
+    `HfApi.upload_folder` checks the files that it sends, but not whether other users commit during the upload. The
+    comparison does, because a tag never moves.
+    """
     repo = plan.repo
     if plan.creates:
         api.create_repo(repo, repo_type="dataset", private=plan.private, exist_ok=True)
