@@ -131,7 +131,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("README", "in {} of the {} cells", count_cells_without_headroom),
     ("docs/index", "{} test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/evaluating", "{} published test tasks", lambda: len(bundled_tasks("test"))),
-    ("docs/evaluating", "{} episodes with {} steps", lambda: (SEEDED.episodes, SEEDED.steps)),
+    ("docs/protocol", "plays {} episodes of {} steps", lambda: (SEEDED.episodes, SEEDED.steps)),
     ("docs/evaluating", "the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
     ("docs/protocol", "up to {} [drawn", max_validation_tasks_per_layout),
     ("docs/protocol", "{} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),

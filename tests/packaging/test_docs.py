@@ -48,8 +48,14 @@ PAGES = {
     for path in sorted(DOCS.rglob("*.md"))
 }
 EVERY_PAGE = pytest.mark.parametrize("page", PAGES)
+WORDS = 15_000
+"""Limit of the words on all pages."""
 COMPILING = ("adapters", "evaluating", "protocol")
 """Pages whose snippets compile environments and models."""
+
+
+def test_documentation_is_short():
+    assert sum(len(text.split()) for text in PAGES.values()) <= WORDS
 
 
 def run_snippets(page: str, folder: Path) -> dict[str, Any]:

@@ -40,7 +40,7 @@ from icrl4aht_baselines.report.statistics import MeanInterval, holm_corrected
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission
 from icrl4aht_baselines.training.seen import overlap_legend, overlap_marks
 from icrl4aht_data.benchmark.best_responses import read_best_responses
-from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
+from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, read_reference_returns
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import add_legend_below, axis_limits, save_figure
@@ -215,7 +215,6 @@ def render_comparison(stored: StoredResults) -> str:
         measured=f"{measured.about.rstrip('.')} (version {measured.version}).",
         cells=f"{len(scored)} of {len(scales)} cells",
         scored=", ".join(dict.fromkeys(cell.layout for cell in scored)) or "none",
-        least=f"{LEAST_HEADROOM:g}",
         alpha=f"{_SIGNIFICANT:g}",
         rows=f"{len(stored.table):,}",
     )
