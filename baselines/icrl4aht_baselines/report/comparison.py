@@ -204,9 +204,9 @@ def render_comparison(stored: StoredResults) -> str:
     return fill_template(
         "results.md",
         agents=agents_table(stored, shown, scales),
-        one_way=", ".join(one_way) or "none",
+        one_way=f" Not measured for: {', '.join(one_way)}." if one_way else "",
         difference=describe_lead(results, scales),
-        controls=controls_table(stored, shown, scales),
+        controls=controls_table(stored, results, scales),
         layouts=layouts_table(results, scales),
         trainings=describe_training_runs(),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
@@ -268,7 +268,7 @@ def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return table 2: benefit M of memory, benefit P of the right context, and mean returns in blocks of episodes.
 
-    The rows are those of table 1. Means are over the combinations of layout and family that the agent played and that
+    Means are over the combinations of layout and family that the agent played and that
     have headroom, or over all that it played if none of them has headroom. M and P are bold if they are above 0 with a
     p-value below 0.05, corrected for all tests in the table.
     """

@@ -189,7 +189,8 @@ def check_submission(found: Submission, where: str) -> None:
 
 def _check_name(found: Submission, where: str) -> None:
     models = {one.settings.get("details", {}).get("model") for one in found.evaluations}
-    if found.agent in AGENTS or (found.agent in bundled_models() and models != {found.agent}):
+    # Further training runs of a bundled model, which is one of the runs, have its name.
+    if found.agent in AGENTS or (found.agent in bundled_models() and found.agent not in models):
         raise OptionError(f"{where}: {found.agent} names a reference ego or a bundled model; give another --name")
     if not re.fullmatch(_NAME, found.agent) or found.agent.endswith(tuple(f" ({way})" for way in OTHER_WAYS)):
         raise OptionError(
