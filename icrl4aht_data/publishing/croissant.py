@@ -13,11 +13,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from icrl4aht_data.format.index import read_index
-from icrl4aht_data.format.schema import FIELDS, PARQUET_EPISODES, PARQUET_INDEX
+from icrl4aht_data.format.schema import PARQUET_EPISODES, PARQUET_INDEX
 from icrl4aht_data.utils.install_hints import AUTHORS, import_optional, project_url
-from icrl4aht_data.utils.text import card_file
-from icrl4aht_data.writing.card import card_texts, episode_texts, rai_texts
+from icrl4aht_data.utils.text import card_file, counted_histories, counted_noun
+from icrl4aht_data.writing.card import card_facts, card_texts, episode_texts, rai_texts
 
 if TYPE_CHECKING:
     import mlcroissant
@@ -56,9 +55,9 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         OptionError: if mlcroissant is not installed.
     """
     mlc = import_optional("mlcroissant", "croissant.json")
-    index, texts = read_index(root), card_texts("arrays")
-    info, sources = index.info, {entry.source for entry in index.entries}
-    arrays = "; ".join(f"{name}: {texts[name]}" for name, field in FIELDS.items() if info.kind not in field.absent)
+    content, texts = card_facts(root), card_texts("arrays")
+    info = content["info"]
+    arrays = "; ".join(f"{name}: {texts[name]}" for name in content["arrays"])
     terms = mlc.Rdf(context=mlc.Rdf().context | _TERMS_OF_1_1)
     context = mlc.Context(rdf=terms, conforms_to=_STANDARD)
     with warnings.catch_warnings():
@@ -81,9 +80,9 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             conforms_to=[_STANDARD, "http://mlcommons.org/croissant/RAI/1.0"],
             name="icrl4aht_learning_histories",
             description=(
-                "Learning histories of ego agents that learn to cook in OvercookedV2 with one fixed teammate each, "
-                f"for in-context reinforcement learning in ad-hoc teamwork: {info.histories:,} histories, "
-                f"{info.transitions:,} transitions, layouts {', '.join(info.layouts)}. "
+                "Learning histories of egos that cook in OvercookedV2 with unknown teammates, for in-context "
+                f"reinforcement learning in ad-hoc teamwork: {counted_histories(info.histories)}, "
+                f"{counted_noun(info.transitions, 'transition')}, layouts {', '.join(info.layouts)}. "
                 f"The shards are HDF5: {arrays}."
             ),
             version=info.data_version,
@@ -95,7 +94,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             keywords=["reinforcement learning", "in-context learning", "ad-hoc teamwork", "Overcooked"],
             distribution=[*files, *sets],
             record_sets=list(records),
-            **rai_texts(sources),
+            **rai_texts(content),
         ).to_json()
 
 

@@ -6,10 +6,10 @@ import json
 import math
 import tomllib
 from collections import Counter, defaultdict
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -57,6 +57,9 @@ from icrl4aht_data.utils.install_hints import project_url
 from icrl4aht_data.utils.text import card_file, counted_noun, markdown_table
 from icrl4aht_data.writing.proof import proof_table, read_proof
 
+if TYPE_CHECKING:
+    from jinja2 import Template
+
 HEADROOM_PROTOCOL = "published"
 """Evaluation protocol of the returns in dataset cards, which is the paper's protocol."""
 
@@ -73,7 +76,7 @@ def card_texts(section: str) -> dict[str, str]:
 
     Args:
         section: "sources" (of histories), "kinds" (of release), "arrays" (`schema.FIELDS`), "index" (fields of
-            `schema.Entry`), "episodes" (other columns of `EPISODE_COLUMNS`) or "rai" (see `rai_texts`).
+            `schema.Entry`), "episodes" (other columns of `EPISODE_COLUMNS`) or "rai" (templates, see `rai_texts`).
     """
     return tomllib.loads(card_file("dataset_texts.toml").read_text(encoding="utf-8"))[section]
 
@@ -82,11 +85,6 @@ def episode_texts() -> dict[str, str]:
     """Return the descriptions of the columns `EPISODE_COLUMNS` by name."""
     texts = card_texts("index") | card_texts("arrays") | card_texts("episodes")
     return {name: texts[name] for name in EPISODE_COLUMNS}
-
-
-def rai_texts(sources: Container[str]) -> dict[str, str]:
-    """Return the texts on responsible AI for a release with these sources, by field name in mlcroissant."""
-    return card_texts("rai") | (card_texts("rai_human") if "human" in sources else {})
 
 
 def write_card(root: Path) -> None:
@@ -102,6 +100,23 @@ def write_card(root: Path) -> None:
 
 def render_card(content: Mapping[str, Any]) -> str:
     """Return the content of README.md for a release with these `card_facts`."""
+    return _card_template().render(content, rai=rai_texts(content))
+
+
+def rai_texts(content: Mapping[str, Any]) -> dict[str, str | list[str]]:
+    """Return the texts on responsible AI for a release with these `card_facts`, by field name in mlcroissant.
+
+    `data_limitations` is the list in the card's section Limits.
+    """
+    card = _card_template()
+    fill = card.environment.from_string
+    texts = {name: fill(text).render(content).strip() for name, text in card_texts("rai").items()}
+    limits = "".join(card.blocks["limits"](card.new_context(dict(content)))).splitlines()
+    return texts | {"data_limitations": [line.removeprefix("* ") for line in limits if line]}
+
+
+def _card_template() -> Template:
+    """Return the template of README.md."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(
@@ -113,7 +128,7 @@ def render_card(content: Mapping[str, Any]) -> str:
         "span": _range_text,
         "proof_table": proof_table,
     }
-    return environment.from_string(card_file("dataset.md").read_text(encoding="utf-8")).render(content)
+    return environment.from_string(card_file("dataset.md").read_text(encoding="utf-8"))
 
 
 def teammate_name(task: Task) -> str:
@@ -174,6 +189,8 @@ def card_facts(root: Path) -> dict[str, Any]:
     length = min(500, *(entry.T for entry in entries if (entry.split, entry.layout) == (first.split, first.layout)))
     tested, learning = benchmark_test_layouts(info.layouts), _learning_rows(tasks, titles)
     sources = Counter(entry.source for entry in entries)
+    labelled = {name: sum(e.has(FIELDS[f"{name}_actions"]) for e in entries) for name in ("expert", "oracle")}
+    absent = {f"{name}_actions" for name, number in labelled.items() if not number}
     return {
         "info": info,
         "url": project_url(),
@@ -183,9 +200,10 @@ def card_facts(root: Path) -> dict[str, Any]:
         "tasks": len(tasks),
         "lengths": [entry.T for entry in entries],
         "sources": sources,
+        "splits": Counter(entry.split for entry in entries),
         "kinds": dict(sorted({(e.teammate_family, e.teammate_kind) for e in entries if e.teammate_family != "rl"})),
         "algorithms": [name for name in ALGORITHMS if name in {entry.teammate_kind for entry in entries}],
-        "labelled": {name: sum(e.has(FIELDS[f"{name}_actions"]) for e in entries) for name in ("expert", "oracle")},
+        "labelled": labelled,
         "views": {
             view: Counter(entry.source for entry in entries if entry.label_view == view)
             for view in dict.fromkeys(entry.label_view for entry in entries if entry.label_view)
@@ -205,13 +223,12 @@ def card_facts(root: Path) -> dict[str, Any]:
         "flat_cells": [
             "/".join(cell) for cell in cells_without_headroom(read_reference_returns(HEADROOM_PROTOCOL), tested)
         ],
-        "arrays": [name for name, array in FIELDS.items() if info.kind not in array.absent or name == "obs"],
+        "arrays": [name for name, array in FIELDS.items() if info.kind not in array.absent and name not in absent],
         **_known_families(tasks),
         "suites": _distinct_values(tasks, "suite"),
         **_generation_facts(tasks),
         "least": {"rise": _LEAST_RISE, "headroom": LEAST_HEADROOM, "same": SAME_BEHAVIOUR},
         "texts": {section: card_texts(section) for section in ("sources", "kinds", "arrays")},
-        "rai": rai_texts(sources),
         "paper": {"ego": PAPER_EGO_STEPS, "teammate": PAPER_TEAMMATE_STEPS, "teammates": PAPER_TEAMMATES * 4},
         "citation": card_file("citation.bib").read_text(encoding="utf-8").strip(),
     }
@@ -394,11 +411,11 @@ def _kind_rows(tasks: Iterable[_TaskFacts], layouts: Iterable[str]) -> list[list
     The columns are the kind; the numbers of different teammates of the kind on the benchmark's training layouts (in
     training, in validation) and on other layouts (the same); and the benchmark's training layouts without a training
     teammate of the kind. A teammate that never acts, or that mixes in random actions, does not count as a member of its
-    family. There are no rows if the release has no tasks.
+    family. There are no rows if the release has no tasks of other splits than test.
     """
     published = [name for name in layouts if name in TESTED_ON]
     found = defaultdict[tuple[str, str, bool], set[tuple[str, str]]](set)
-    for task in (one.task for one in tasks if one.task is not None):
+    for task in (one.task for one in tasks if one.task is not None and one.task.split != "test"):
         name = task.layout.name
         key = name, json.dumps(task.teammate, sort_keys=True)  # unlike `teammate_key`, without the recipes
         found[_teammate_kind(task), task.split, name in TESTED_ON].add(key)

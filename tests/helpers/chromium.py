@@ -57,8 +57,8 @@ def wait_until(page: Any, condition: str, seconds: float = 30) -> None:
         page.wait_for_timeout(20)
 
 
-def check_fits_phone(page: Any, dark: bool) -> None:
-    """Assert that a page fits the width of a phone, and that its background is dark if and only if `dark` is set."""
-    assert page.evaluate("document.documentElement.scrollWidth") == PHONE
+def check_fits_window(page: Any, width: int, dark: bool) -> None:
+    """Assert that a page is no wider than its window, and that its background is dark if and only if `dark` is set."""
+    assert page.evaluate("document.documentElement.scrollWidth") == width
     shade = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
     assert (max(shade) < 60) is dark

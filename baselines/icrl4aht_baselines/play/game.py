@@ -26,7 +26,7 @@ from icrl4aht_baselines.agents.host import EgoInput
 from icrl4aht_baselines.evaluate.rollout import EGO_STEPS, TEAMMATE_STEPS
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import unknown_name
+from icrl4aht_data.errors import OptionError, UnknownNameError, unknown_name
 from icrl4aht_data.format.schema import episode_ends
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import EGO, STAY
@@ -108,14 +108,20 @@ def find_partner(name: str, layout: Layout, slot: int) -> Partner:
         slot: 0 or 1, number of the agent that the partner plays.
 
     Raises:
-        UnknownNameError: if the name is unknown, or the layout belongs to no track.
+        UnknownNameError: if the name is unknown.
         OptionError: if the partner cannot play on the layout.
     """
     if name == HUMAN:
         return Partner(None)
     tests = [f"{family}/t{t}" for family in HEURISTIC_KINDS.values() for t in range(INSTANCES)]
     if name in tests:
-        task = published_task(layout.name, name)
+        try:
+            task = published_task(layout.name, name)
+        except UnknownNameError as error:  # the layout is in no split of the tracks with test teammates
+            raise OptionError(
+                f"--with {name}: test teammates play only the layouts of the benchmark, found {layout.name}; give "
+                f"another --layout, or a partner that plays this one: {', '.join((HUMAN, *agent_names()))}"
+            ) from error
         policy = build_teammate(layout, task.teammate, slot)
         return Partner(PolicyPlayer(policy, layout, slot, is_ego=False), task)
     if name not in agent_names() and not Path(name).is_dir():

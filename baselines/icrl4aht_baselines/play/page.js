@@ -25,7 +25,7 @@ function open() {
   socket.onclose = ({ code }) => {
     held = null;
     const lost = "The connection is lost; what you played is kept. This page connects again by itself.";
-    say(code === TAKEN ? "Another browser plays this game. This page joins when it leaves." : lost);
+    say(code === TAKEN ? "Another browser already plays this game. Close it to play here; this page then connects by itself." : lost);
     setTimeout(open, RETRY_AFTER);
   };
 }
@@ -75,7 +75,7 @@ function whatNext(episode) {
   if (!frame.waiting) return "";
   if (frame.ready) return "Waiting for the other person to press a key.";
   const last = frame.clock === 0 && frame.returns.length ? `You earned ${frame.returns.at(-1)}. ` : "";
-  return `${last}Press an arrow key ${frame.clock ? "to go on with" : "or touch a button to start"} episode ${episode}.`;
+  return `${last}Press an arrow key or touch a button to ${frame.clock ? "continue" : "start"} episode ${episode}.`;
 }
 
 function draw() {
@@ -106,7 +106,7 @@ function showEnd() {
     return returns.length ? `${name}: ${mean(returns)} an episode on average` : `${name}: cannot play this layout`;
   });
   $("means").replaceChildren(...sentences.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
-  $("end-title").textContent = setup.compared.length ? `Thank you! You, and others in your place with ${setup.partner}` : "Thank you! Your returns";
+  $("end-title").textContent = setup.compared.length ? `Thank you! Your returns with ${setup.partner}, and those of other players` : "Thank you! Your returns";
   $("recorded").textContent = frame.recorded && !frame.problem ? `Recorded in ${frame.recorded}` : "";
 }
 

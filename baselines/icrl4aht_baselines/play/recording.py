@@ -83,7 +83,10 @@ class GameRecorder:
     """
 
     def __init__(self, folder: Path, task: Task, ticks: float) -> None:
-        check_target(folder, overwrite=False)
+        try:
+            check_target(folder, overwrite=False)
+        except OptionError as error:
+            raise OptionError(f"--record {folder}: exists, expected a new folder; give another one") from error
         self.folder, self.task, self.ticks, self.written = folder, task, ticks, 0
         self.pseudonym: str | None = None
         self.views: list[list[str]] = []

@@ -29,7 +29,7 @@ from icrl4aht_data.browsing.drawings import add_drawings, layout_drawings
 from icrl4aht_data.browsing.page import page_source, page_style
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
-from icrl4aht_data.overcooked.cells import BUTTON, WINDOW
+from icrl4aht_data.overcooked.cells import BUTTON, INDICATOR, WINDOW
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD, PRESS_REWARD, WRONG_DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import POT_STEPS, swap_agents
@@ -44,12 +44,14 @@ _ALL_CONNECTED = 4000  # websocket close code: everyone who plays is already con
 
 def how_to_play(layout: Layout) -> str:
     """Return text that explains the game to a person who has never played it."""
-    button = f" Pressing ? shows the recipe and costs {-PRESS_REWARD:g}." if BUTTON in layout.kinds else ""
+    board = "on the white board and " if INDICATOR in layout.kinds else ""
+    button = f"press ? (this costs {-PRESS_REWARD:g}), " if BUTTON in layout.kinds else ""
     return (
         f"You are the blue chef: move with the arrow keys; space takes, puts down, cooks and serves what is in front "
         f"of you. Put the recipe's three ingredients into a pot, wait {POT_STEPS} steps, take the soup with a plate "
-        f"and serve it at the green cell with the bell. The right soup earns {DELIVERY_REWARD:+g}, a wrong one "
-        f"{WRONG_DELIVERY_REWARD:g}.{button}"
+        f"and serve it at the green bell. The right soup earns {DELIVERY_REWARD:+g}, a wrong one "
+        f"{WRONG_DELIVERY_REWARD:g}. The recipe is {board}below the whole map. If you cannot see it, {button}watch "
+        f"what your partner cooks, or try one."
     )
 
 

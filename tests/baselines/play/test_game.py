@@ -12,7 +12,7 @@ from icrl4aht_baselines.evaluate.rollout import task_key
 from icrl4aht_baselines.play.game import Game, PolicyPlayer, find_partner
 from icrl4aht_generation.policy import Policy
 
-from icrl4aht_data.errors import UnknownNameError
+from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.actions import INTERACT
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
@@ -54,6 +54,15 @@ def test_egos_can_play_in_the_teammate_slot():
     assert game.people == [0]
     cooking = [find_partner("oracle", LAYOUT, slot).player for slot in (0, 1)]
     assert sum(Game(LAYOUT, cooking, task_key(0, "x"), 1, 100).play()) > 0
+
+
+def test_partner_that_cannot_play_the_layout_is_refused_with_names_of_others():
+    """A test teammate cannot play a generated layout, and each partner that the message names can."""
+    layout = get_layout("rooms-0-46")
+    with pytest.raises(OptionError, match=r"--with H1/t0: test .* found rooms-0-46; .* plays this one: human, stay"):
+        find_partner("H1/t0", layout, 1)
+    for name in ("stay", "random", "oracle", "search", "rl2-reference"):
+        assert find_partner(name, layout, 1).player
 
 
 def test_find_partner_accepts_known_names_only(tmp_path):

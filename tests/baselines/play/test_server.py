@@ -4,22 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from icrl4aht_baselines.evaluate.rollout import task_key
-from icrl4aht_baselines.play.game import Game, PolicyPlayer, find_partner
-from icrl4aht_baselines.play.recording import GameRecorder, human_task
-from icrl4aht_generation.experts.oracle import oracle
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.browsing.page import make_browser_page
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
-from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.plotting import plot_learning_curves
 from tests.helpers.commands import run_cli
@@ -28,22 +22,10 @@ starlette = pytest.importorskip("starlette.testclient", reason="needs the extra 
 
 from icrl4aht_baselines.play.server import PlaySession, make_app, open_port  # noqa: E402
 
-LAYOUT = get_layout("cramped_up")
+from tests.helpers.play import LAYOUT, new_session, scripted_person  # noqa: E402
+
 UP, DOWN, LEFT, RIGHT, STAY, INTERACT = range(6)
 ORIGIN = {"origin": "http://127.0.0.1"}
-
-
-def new_session(
-    partner: str = "stay", episodes: int = 2, steps: int = 8, record: Path | None = None, **options: Any
-) -> PlaySession:
-    """Return a session without reference egos, in which the game steps only when a test sends an action."""
-    found = find_partner(partner, LAYOUT, 1)
-    recorder, name = None, "a test"
-    if record:
-        task = human_task(found, 7)
-        recorder, name = GameRecorder(record, task, 0), task.task_id
-    game = Game(LAYOUT, [None, found.player], task_key(0, name), episodes, steps)
-    return PlaySession(game, partner, **{"ticks": 0, "recorder": recorder, "compared": ()} | options)
 
 
 class Browser:
@@ -79,7 +61,8 @@ def make_client(session: PlaySession) -> Any:
 def test_keys_move_the_agent_by_the_rules():
     session = new_session()
     with make_client(session) as client, open_browser(client) as player:
-        assert "arrow keys" in client.get("/").text
+        text = client.get("/").text
+        assert "arrow keys" in text and "The recipe is on the white board and below the whole map." in text
         assert player.setup["actions"] == list(ACTIONS)
         assert (player.frame["waiting"], player.frame["clock"]) == (True, 0)
         player.act(STAY)  # the first key starts the episode without a step
@@ -96,13 +79,11 @@ def test_keys_move_the_agent_by_the_rules():
 
 def play_oracle_actions(player: Browser, episodes: int, steps: int) -> None:
     """Play episodes with the oracle's actions instead of a person's keys."""
-    plan = PolicyPlayer(oracle(LAYOUT), LAYOUT, EGO, is_ego=True)
-    key, before = task_key(0, "plan"), (None,) * 5
+    act = scripted_person()
     for episode in range(episodes):
-        plan.begin(key, key, episode)
         player.act(STAY)
         for t in range(steps):
-            player.act(plan.act(np.array(player.frame["record"], np.uint8), before, t))  # type: ignore[arg-type]
+            player.act(act(player.frame["record"], episode, t))
 
 
 def test_recorded_game_is_a_valid_release(tmp_path):
@@ -224,7 +205,8 @@ def test_play_command_rejects_invalid_options(tmp_path):
         port = taken.getsockname()[1]
         for words, message in (
             (("--with", "stay", "--port", port), f"port {port} of 127.0.0.1"),
-            (("--record", tmp_path / "full"), "full: exists"),
+            (("--record", tmp_path / "full"), "full: exists, expected a new folder; give another one"),
+            (("--layout", "rooms-0-46", "--with", "H1/t0"), "test teammates play only the layouts of the benchmark"),
             (("--with", "oracle", *record), "only test teammates"),
             (("--slot", "teammate", *record), "only the ego can be recorded"),
             (("--with", "H9/t9"), "unknown partner 'H9/t9'"),

@@ -11,7 +11,7 @@ from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, ResultCell
 from PIL import Image
 
-from tests.helpers.chromium import NEEDS_CHROMIUM, PHONE, check_fits_phone, chromium
+from tests.helpers.chromium import NEEDS_CHROMIUM, PHONE, check_fits_window, chromium
 from tests.helpers.evaluated import evaluated_run
 
 pytestmark = [pytest.mark.slow, NEEDS_CHROMIUM]
@@ -46,4 +46,4 @@ def test_report_fits_the_width_of_a_phone(report_file, dark):
         shown.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true })")
         assert shown.locator("section").count() == 6
         assert shown.evaluate(TOO_WIDE, PHONE) == []
-        check_fits_phone(shown, dark)
+        check_fits_window(shown, PHONE, dark)

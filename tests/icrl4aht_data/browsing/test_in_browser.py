@@ -18,7 +18,7 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import draw_frame
-from tests.helpers.chromium import NEEDS_CHROMIUM, PHONE, check_fits_phone, chromium, wait_until
+from tests.helpers.chromium import NEEDS_CHROMIUM, PHONE, check_fits_window, chromium, wait_until
 from tests.helpers.random_releases import random_release
 
 pytestmark = NEEDS_CHROMIUM
@@ -173,7 +173,7 @@ def test_playback_stops_at_the_end_of_the_episode_and_can_be_paused(open_page):
 def test_page_fits_the_width_of_a_phone(open_page, dark):
     page = open_page("#history=0&episode=1&step=3&ends=1", width=PHONE, dark=dark)
     assert page.locator(".pane").count() == 2
-    check_fits_phone(page, dark)
+    check_fits_window(page, PHONE, dark)
     page.close()
 
 

@@ -135,6 +135,24 @@ def test_croissant_file_is_valid_and_its_records_equal_the_index(published_relea
     assert hashed == {name: listed[name] for name in listed if name != "croissant.json"}
 
 
+def test_croissant_file_of_human_histories_is_true_and_valid(tmp_path):
+    import mlcroissant
+
+    source = tmp_path / "source"
+    random_release(source, "lite", ("cramped_down",), teammates=1, streams=1, labels=False, sources=["human"])
+    root = build_release(source, tmp_path / "built", published=DAY)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # dependencies of mlcroissant raise warnings
+        described = mlcroissant.Dataset(str(root / "croissant.json"))
+    assert (described.metadata.ctx.issues.errors, described.metadata.ctx.issues.warnings) == (set(), set())
+    content = json.loads((root / "croissant.json").read_text())
+    assert "1 history, 120 transitions" in content["description"] and "labels" not in content["description"]
+    assert "There are no labels." in content["rai:dataAnnotationProtocol"]
+    assert content["rai:dataPreprocessingProtocol"] == "Histories of human have all finished episodes."
+    limits = content["rai:dataLimitations"]
+    assert len(limits) > 2 and all(f"* {limit}\n" in (root / "README.md").read_text() for limit in limits)
+
+
 def test_the_card_describes_the_release(published_release):
     card = (published_release / "README.md").read_text()
     facts = front_matter(card)

@@ -132,11 +132,33 @@ def test_bundled_card_is_short_and_up_to_date():
     assert len(words) <= 2500
 
 
-def test_card_of_human_histories_describes_personal_data():
-    assert rai_texts({"noise"})["personal_sensitive_information"] == "None."
-    rai = rai_texts({"noise", "human"})
-    assert "Pseudonyms" in rai["personal_sensitive_information"] and rai.keys() == rai_texts({"noise"}).keys()
-    assert f"* Personal data: {rai['personal_sensitive_information']}" in render_card(card_facts(MINI) | {"rai": rai})
+def test_card_of_human_histories_says_only_what_is_true_of_them(write_meta):
+    played = (heuristic_task("demo_wide", "H1", 0, "test"), make_provenance("human"), [(0, 0.0, 20.0)])
+    content = write_meta([played], has_expert_actions=False)
+    rai, card = rai_texts(content), render_card(content)
+    assert rai["data_collection"].startswith("People play a simulated game with programs")
+    assert rai["data_preprocessing_protocol"] == "Histories of human have all finished episodes."
+    assert rai["data_annotation_protocol"] == "There are no labels. Nobody annotated anything by hand."
+    assert "The people are volunteers" in rai["data_biases"] and "unequal" not in rai["data_biases"]
+    assert "Teammates are scripts, not people." in rai["data_biases"]
+    assert "Pseudonyms" in rai["personal_sensitive_information"]
+    assert "delete their games" in rai["data_release_maintenance_plan"]
+    assert [line.split(":")[0] for line in rai["data_limitations"][-1:]] == ["1 history of split `test`"]
+    assert "No history has labels." in card and "expert_actions" not in card and "400 steps" not in card
+    assert "Every episode has 20 steps." in card and "* 1 history of 1 task, " in card
+    assert "`human` (1 history)" in card and "ten episodes" not in card and "## Teammates" not in card
+    assert all(f"* {line}\n" in card for line in rai["data_limitations"])
+    assert f"* Personal data: {rai['personal_sensitive_information']}\n" in card
+
+    both = rai_texts(write_meta([*four_tasks(), played]))
+    assert both["data_collection"].startswith("Programs and, in the source human, people play")
+    assert both["data_preprocessing_protocol"].endswith("Histories of noise are complete and not selected.")
+    assert "unequal" in both["data_biases"] and "Labels are actions" in both["data_annotation_protocol"]
+
+    without = rai_texts(write_meta())
+    assert without["personal_sensitive_information"] == "None."
+    assert without["data_limitations"][-1] == "Nothing here shows how an agent plays with people."
+    assert without.keys() == both.keys() == rai.keys()
 
 
 def test_card_texts_describe_every_field():
