@@ -103,7 +103,7 @@ def render_card(content: Mapping[str, Any]) -> str:
     return _card_template().render(content, rai=rai_texts(content))
 
 
-def rai_texts(content: Mapping[str, Any]) -> dict[str, str | list[str]]:
+def rai_texts(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the texts on responsible AI for a release with these `card_facts`, by field name in mlcroissant.
 
     `data_limitations` is the list in the card's section Limits.

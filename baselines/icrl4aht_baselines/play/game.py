@@ -24,13 +24,13 @@ from icrl4aht_generation.teammates.registry import build_teammate
 from icrl4aht_baselines.agents.egos import agent_names, find_agent
 from icrl4aht_baselines.agents.host import EgoInput
 from icrl4aht_baselines.evaluate.rollout import EGO_STEPS, TEAMMATE_STEPS
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, LAYOUT_NAMES
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import OptionError, UnknownNameError, unknown_name
+from icrl4aht_data.errors import OptionError, unknown_name
 from icrl4aht_data.format.schema import episode_ends
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import EGO, STAY
-from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import swap_agents
 
@@ -115,13 +115,12 @@ def find_partner(name: str, layout: Layout, slot: int) -> Partner:
         return Partner(None)
     tests = [f"{family}/t{t}" for family in HEURISTIC_KINDS.values() for t in range(INSTANCES)]
     if name in tests:
-        try:
-            task = published_task(layout.name, name)
-        except UnknownNameError as error:  # the layout is in no split of the tracks with test teammates
+        if layout.name not in (*LAYOUT_NAMES, *LAYOUT_PLUGINS.names):
             raise OptionError(
                 f"--with {name}: test teammates play only the layouts of the benchmark, found {layout.name}; give "
                 f"another --layout, or a partner that plays this one: {', '.join((HUMAN, *agent_names()))}"
-            ) from error
+            )
+        task = published_task(layout.name, name)
         policy = build_teammate(layout, task.teammate, slot)
         return Partner(PolicyPlayer(policy, layout, slot, is_ego=False), task)
     if name not in agent_names() and not Path(name).is_dir():

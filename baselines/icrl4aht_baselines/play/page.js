@@ -82,7 +82,8 @@ function draw() {
   const { layout } = setup;
   const cells = $("window").checked ? setup.window : 0;
   const [width, height] = cells ? [cells, cells] : [layout.width, layout.height + layout.footer];
-  const room = Math.min($("board").clientWidth, (0.62 * window.innerHeight * width) / height);
+  const share = $("pad").offsetHeight ? 0.42 : 0.58; // of the window's height; the buttons for touch need space
+  const room = Math.min($("board").clientWidth, (share * window.innerHeight * width) / height);
   $("picture").style.width = `${Math.max(200, Math.min(room, 72 * width))}px`;
   if ($("board").clientWidth) drawState($("picture"), layout, frame.record, cells);
 }
@@ -106,7 +107,7 @@ function showEnd() {
     return returns.length ? `${name}: ${mean(returns)} an episode on average` : `${name}: cannot play this layout`;
   });
   $("means").replaceChildren(...sentences.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
-  $("end-title").textContent = setup.compared.length ? `Thank you! Your returns with ${setup.partner}, and those of other players` : "Thank you! Your returns";
+  $("end-title").textContent = setup.compared.length ? `Thank you! Your returns by episode with ${setup.partner}, and those of other players` : "Thank you! Your returns by episode";
   $("recorded").textContent = frame.recorded && !frame.problem ? `Recorded in ${frame.recorded}` : "";
 }
 

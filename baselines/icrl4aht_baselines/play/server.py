@@ -49,9 +49,8 @@ def how_to_play(layout: Layout) -> str:
     return (
         f"You are the blue chef: move with the arrow keys; space takes, puts down, cooks and serves what is in front "
         f"of you. Put the recipe's three ingredients into a pot, wait {POT_STEPS} steps, take the soup with a plate "
-        f"and serve it at the green bell. The right soup earns {DELIVERY_REWARD:+g}, a wrong one "
-        f"{WRONG_DELIVERY_REWARD:g}. The recipe is {board}below the whole map. If you cannot see it, {button}watch "
-        f"what your partner cooks, or try one."
+        f"and serve it at the green bell: {DELIVERY_REWARD:+g}, a wrong soup {WRONG_DELIVERY_REWARD:g}. The recipe is "
+        f"{board}below the whole map. If you cannot see it, {button}watch what your partner cooks, or try a soup."
     )
 
 
