@@ -368,6 +368,7 @@ def write_bundled_card(name: str, jobs: Sequence[ReferenceJob], folder: Path = M
     ]
     taught = f" --teacher {jobs[0].teacher}" if jobs[0].teacher else ""
     command = f"icrl4aht-data research reference --name {jobs[0].model}{taught} --bundle-as {name}"
+    recorded = "" if "groups" in config["histories"] else "These histories were recorded for it, and are in no release."
     properties = [
         f"| method | {config['method']} |",
         f"| created with | icrl4aht-data {config['package_version']} |",
@@ -379,7 +380,7 @@ def write_bundled_card(name: str, jobs: Sequence[ReferenceJob], folder: Path = M
         "baseline.md",
         title=name,
         method=config["method"],
-        training=" ".join(dict.fromkeys(map(training_sentence, configs))),
+        training=" ".join([*dict.fromkeys(map(training_sentence, configs)), recorded]).rstrip(),
         properties="\n".join(properties),
         models="\n".join(_model_row(run, sources) for sources in models.values()),
         protocol=run.protocol,

@@ -108,6 +108,7 @@ def test_card_of_a_reference_model_shows_command_and_training_curves(tmp_path, m
         "| made by | `icrl4aht-data research reference --name ad-reference --teacher rl2-reference --bundle-as ad-x` |"
         in card
     )
+    assert "These histories were recorded for it, and are in no release.\n" in card
     shown = re.findall(r"!\[\w+\]\((.+)\)", card.split("## Curves")[1].split("## Limits")[0])
     assert shown == ["layout/curves.png"]
 
