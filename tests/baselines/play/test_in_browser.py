@@ -161,8 +161,8 @@ def test_ten_recorded_episodes_of_a_script_are_a_valid_history(tmp_path):
         wait_until(page, "frame.over && Object.keys(frame.references).length === 3", 120)
         returns, delays = page.evaluate("[frame.returns, delays]")
         assert f"{record}: 10 episodes;" in stop(page, server)
-    middle, last = np.percentile(delays, (50, 99))
-    print(f"\nfrom a key to the new picture: median {middle:.0f} ms, 99% within {last:.0f} ms ({len(delays)} keys)")
+    middle, most = np.percentile(delays, (50, 95))
+    print(f"\nfrom a key to the new picture: median {middle:.0f} ms, 95% within {most:.0f} ms ({len(delays)} keys)")
     report = verify_release(record, level="deep")
     assert report.ok, report.findings
     dataset = load_icrl4aht(record)
