@@ -362,7 +362,7 @@ def write_bundled_card(name: str, jobs: Sequence[ReferenceJob], folder: Path = M
     seeds = ", ".join(dict.fromkeys(str(config["train"]["seed"]) for config in configs))
     overlaps = {overlap for one in (run, *validation) for overlap in one.overlaps(one.cells)}
     limits = [
-        f"Each model is one run, of seed {seeds}: the variation between seeds is not known.",
+        f"The results are of one run, of seed {seeds}. They do not show the variation between runs.",
         "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
         *overlap_legend(overlaps),
     ]

@@ -238,7 +238,8 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None) -> None:
     """Check that a command may write a file, or files into a folder.
 
-    Folders, links, and files of another kind than their suffix says are never replaced.
+    Folders and links are never replaced. A single file with one of the suffixes in `_STARTS` is only replaced if it has
+    the kind that its suffix says.
 
     Args:
         path: the file to write; with `names`, the folder.
@@ -259,16 +260,16 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
             raise OptionError(f"{file}: expected a file, found a folder or a link; give another name")
         if file.exists() and not overwrite:
             raise OptionError(f"{file}: exists; give another name, or use --overwrite to replace it")
-        start = _STARTS.get(file.suffix, b"")
+        start = _STARTS.get(file.suffix, b"") if names is None else b""
         if file.exists() and not starts_with(file, start):
             wrong = f"{file}: not a {file.suffix} file that this package writes"
             raise OptionError(f"{wrong}, so it is not replaced; give another name, or remove it")
 
 
 def starts_with(path: Path, start: bytes) -> bool:
-    """Return whether a file starts with the given bytes."""
+    """Return whether a file starts with the given bytes, or white space and these bytes, as older pages do."""
     with path.open("rb") as stream:
-        return stream.read(len(start)) == start
+        return stream.read(len(start) + 64).lstrip().startswith(start)
 
 
 def check_folder_content(folder: Path, names: Collection[str], what: str) -> None:

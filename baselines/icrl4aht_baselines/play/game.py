@@ -117,8 +117,8 @@ def find_partner(name: str, layout: Layout, slot: int) -> Partner:
     if name in tests:
         if layout.name not in (*LAYOUT_NAMES, *LAYOUT_PLUGINS.names):
             raise OptionError(
-                f"--with {name}: test teammates play only the layouts of the benchmark, found {layout.name}; give "
-                f"another --layout, or a partner that plays this one: {', '.join((HUMAN, *agent_names()))}"
+                f"--with {name}: test teammates play only published and registered layouts, found {layout.name}; "
+                f"give another --layout, or a partner that plays this one: {', '.join((HUMAN, *agent_names()))}"
             )
         task = published_task(layout.name, name)
         policy = build_teammate(layout, task.teammate, slot)

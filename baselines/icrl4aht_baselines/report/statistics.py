@@ -1,6 +1,6 @@
 """Means and ratios with 95 % intervals, p-values, and the correction of p-values.
 
-Intervals are studentised bootstrap intervals (Efron and Tibshirani 1993, ch. 12.5). With five teammates, percentile
+Intervals are studentized bootstrap intervals (Efron and Tibshirani 1993, ch. 12.5). With five teammates, percentile
 intervals would be too narrow by a tenth, since the variance of resamples is (n - 1) / n of the true variance; dividing
 by the standard error of each resample corrects this. Teammates' behaviours are resampled within a combination of layout
 and family, or the seeds if there is a single behaviour. Training runs are resampled for all combinations together. The
@@ -97,11 +97,11 @@ def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMP
     resampled = [[_resample(stratum, resamples, rng) for stratum in group] for group in groups]
     with np.errstate(divide="ignore", invalid="ignore"):
         means, variances = _estimate(resampled, drawn)
-        studentised = (means - mean) / np.sqrt(variances)
-    studentised = studentised[np.isfinite(studentised)]
+        studentized = (means - mean) / np.sqrt(variances)
+    studentized = studentized[np.isfinite(studentized)]
     error = float(np.sqrt(variance))
-    low, high = mean - error * np.quantile(studentised, (0.975, 0.025))
-    p = (1 + np.sum(np.abs(studentised) >= abs(mean) / error)) / (1 + len(studentised))
+    low, high = mean - error * np.quantile(studentized, (0.975, 0.025))
+    p = (1 + np.sum(np.abs(studentized) >= abs(mean) / error)) / (1 + len(studentized))
     return MeanInterval(float(mean), float(low), float(high), float(p))
 
 

@@ -188,9 +188,10 @@ def check_submission(found: Submission, where: str) -> None:
 
 
 def _check_name(found: Submission, where: str) -> None:
-    models = {one.settings.get("details", {}).get("model") for one in found.evaluations}
-    # Further training runs of a bundled model, which is one of the runs, have its name.
-    if found.agent in AGENTS or (found.agent in bundled_models() and found.agent not in models):
+    own = [one for one in found.evaluations if not one.control] or found.evaluations
+    models = {one.settings.get("details", {}).get("model") for one in own} & bundled_models().keys()
+    # Further training runs of a bundled model have its name only together with the model's own results.
+    if found.agent in AGENTS or (found.agent in bundled_models() and models != {found.agent}):
         raise OptionError(f"{where}: {found.agent} names a reference ego or a bundled model; give another --name")
     if not re.fullmatch(_NAME, found.agent) or found.agent.endswith(tuple(f" ({way})" for way in OTHER_WAYS)):
         raise OptionError(

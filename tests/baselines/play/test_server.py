@@ -206,7 +206,7 @@ def test_play_command_rejects_invalid_options(tmp_path):
         for words, message in (
             (("--with", "stay", "--port", port), f"port {port} of 127.0.0.1"),
             (("--record", tmp_path / "full"), "full: exists, expected a new folder; give another one"),
-            (("--layout", "rooms-0-46", "--with", "H1/t0"), "test teammates play only the layouts of the benchmark"),
+            (("--layout", "rooms-0-46", "--with", "H1/t0"), "test teammates play only published"),
             (("--with", "oracle", *record), "only test teammates"),
             (("--slot", "teammate", *record), "only the ego can be recorded"),
             (("--with", "H9/t9"), "unknown partner 'H9/t9'"),

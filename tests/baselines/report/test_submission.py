@@ -50,6 +50,13 @@ def rename_task(one: dict[str, Any], task: str, name: str) -> None:
     one["returns"][name] = one["returns"].pop(task)
 
 
+def name_only_control(content: dict[str, Any], model: str) -> None:
+    """Give a submission the name of a bundled model that only its results with a control come from."""
+    content["agent"] = model
+    (control,) = [one for one in content["evaluations"] if one["control"] == "cleared"]
+    control["settings"]["details"]["model"] = model
+
+
 OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
 
 
@@ -58,6 +65,7 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
     [
         (lambda c, one, task: c.update(agent="search"), "search names a reference ego or a bundled model; give"),
         (lambda c, one, task: c.update(agent="dpt-reference"), "dpt-reference names a reference ego or a bundled"),
+        (lambda c, one, task: name_only_control(c, "dpt-reference"), "names a reference ego or a bundled"),
         (lambda c, one, task: c.update(agent="rule (greedy)"), "without a play mode at the end"),
         (lambda c, one, task: c.update(agent="a | b"), "not a file of results: .*matching regex"),
         (lambda c, one, task: c.update(best_responses="99"), r"best responses '99', but this package has '0'"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import check_output
+from icrl4aht_data.utils.files import PAGE_START, check_output
 
 
 def test_check_output_allows_replacing_files_only_on_request(tmp_path):
@@ -13,6 +13,8 @@ def test_check_output_allows_replacing_files_only_on_request(tmp_path):
     check_output(path, overwrite=False)
     path.write_bytes(b"\x89PNG\r\n\x1a\n")
     check_output(path, overwrite=True)
+    (tmp_path / "page.html").write_bytes(b"\n\n" + PAGE_START)
+    check_output(tmp_path / "page.html", overwrite=True)
     with pytest.raises(OptionError, match=r"file\.png: exists; give another name, or use --overwrite to replace it"):
         check_output(path, overwrite=False)
     (tmp_path / "link.png").symlink_to(path)
@@ -42,6 +44,8 @@ def test_check_output_checks_the_named_files_of_a_folder(tmp_path):
         check_output(tmp_path, False, ["report.md"])
     (tmp_path / "report.md").write_text("old")
     check_output(tmp_path, True, ["report.md"])
+    (tmp_path / "numbers.json").write_text('{\n "published": 1}')
+    check_output(tmp_path, True, ["numbers.json"])
     (tmp_path / "page.html").mkdir()
     with pytest.raises(OptionError, match=r"page\.html: expected a file, found a folder or a link"):
         check_output(tmp_path, True, ["report.md", "page.html"])
