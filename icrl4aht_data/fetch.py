@@ -175,8 +175,10 @@ class Remote(ReleaseLocation):
         address, target = f"{self.url}/{name}", self.path(name)
         if scratch is None:
             _remove_from_cache(target)  # otherwise the client would keep the cached file
-        most = disk.TEXT_BYTES if name.endswith(".json") else disk.LARGEST
-        most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else most
+        if name.startswith("data/"):
+            most = self._shard_sizes.get(name, 2**62)
+        else:
+            most = disk.TEXT_BYTES if name.endswith(".json") else disk.LARGEST
         path = _fetch_with_retries(self.client, address, name, scratch, advance, most)
         size, found = path.stat().st_size, disk.file_hash(path)
         if found != self.manifest[name]:

@@ -186,7 +186,7 @@ def layout_sort_key(layout: str) -> tuple[int, str]:
 
 
 def layout_number(layout: str) -> int:
-    """Return the number that stands for a layout (short name) in seeds: the layout's position in `LAYOUT_NAMES`.
+    """Return the number of a layout (short name) for making seeds: its position in `LAYOUT_NAMES`.
 
     A registered layout's number is a hash of its name, so the number does not depend on the installed packages.
     """

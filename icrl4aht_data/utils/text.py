@@ -60,7 +60,7 @@ def fill_template(template: str, **values: str) -> str:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], right: int = 0) -> str:
-    """Return a Markdown table whose last `right` columns are right-aligned."""
+    """Return a Markdown table; the last `right` columns are aligned to the right."""
     rule = "|" + "---|" * (len(header) - right) + "---:|" * right
     lines = [f"| {' | '.join(cells)} |" for cells in (header, *rows)]
     return "\n".join([lines[0], rule, *lines[1:]])

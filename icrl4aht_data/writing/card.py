@@ -359,7 +359,7 @@ def _layout_rows(
 
 
 def _known_families(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
-    """Return how similar heuristic training and validation teammates are to test teammates.
+    """Group the families of heuristics in training and validation by their similarity to test teammates.
 
     Returns:
         `tested`: families with a teammate that behaves the same as a test teammate of its family, or that was not

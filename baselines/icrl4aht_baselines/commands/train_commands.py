@@ -136,9 +136,9 @@ def report_command(
     """Compare results with the paper's.
 
     RESULTS are folders that `evaluate` made. Prints a summary of each agent, and tables of returns. Results under the
-    protocol `published` are shown next to the paper's numbers. Scores are marked if the teammates or
-    layouts were used in training. Writes the tables as report.md, and all numbers as report.csv. Results of one agent
-    on different layouts are merged.
+    protocol `published` are shown next to the paper's numbers. Scores are marked if the teammates or layouts were used
+    in training. Writes the tables as report.md, and all numbers as report.csv. Results of one agent on different
+    layouts are merged.
     """
     from icrl4aht_baselines.report import page
     from icrl4aht_baselines.report.results import merge, read_run

@@ -268,9 +268,9 @@ def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return table 2: benefit M of memory, benefit P of the right context, and mean returns in blocks of episodes.
 
-    Means are over the combinations of layout and family that the agent played and that
-    have headroom, or over all that it played if none of them has headroom. M and P are bold if they are above 0 with a
-    p-value below 0.05, corrected for all tests in the table.
+    Means are over the combinations of layout and family that the agent played and that have headroom, or over all that
+    it played if none of them has headroom. M and P are bold if they are above 0 with a p-value below 0.05, corrected
+    for all tests in the table.
     """
     chosen = {agent: _controlled_cells(cells, scales) for agent, cells in results.items()}
     found = {

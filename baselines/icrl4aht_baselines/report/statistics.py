@@ -71,7 +71,11 @@ def mean_interval(*cells: Float[np.ndarray, "U ..."]) -> MeanInterval:
 
 
 def stratum_of_values(values: Float[np.ndarray, "T U ..."]) -> Stratum:
-    """Return a stratum whose ratio is the mean of values of shape (T, U) or (T, U, S); all denominators are 1."""
+    """Return a stratum for the mean of values: its denominators are 1, so that its ratio is this mean.
+
+    Args:
+        values: float64 of shape (T, U) or (T, U, S).
+    """
     values = values.reshape(*values.shape[:2], -1)
     units = values.mean(axis=2) if values.shape[1] > 1 else values[:, 0]
     return Stratum(units, np.ones(units.shape[1]))

@@ -219,7 +219,7 @@ class OracleView:
 
     @cached_property
     def spoiled_pots(self) -> Bool[Array, " P"]:
-        """Partly filled pots whose contents the ego cannot complete to any recipe that it should cook.
+        """Partly filled pots that the ego cannot complete to a soup that it should cook.
 
         No pot counts if the ego cannot serve, or while a soup of the current recipe is in stock.
         """

@@ -42,7 +42,7 @@ def agent_rooms(layout: Layout) -> np.ndarray:
 
 
 def symmetric_images(grid: np.ndarray) -> list[np.ndarray]:
-    """Return eight arrays, some of them perhaps equal: a grid, its rotations, and the mirror images of these four."""
+    """Return eight arrays: a grid in its four rotations, and their mirror images. Some of them may be equal."""
     return [image for turns in range(4) for image in (np.rot90(grid, turns), np.rot90(grid, turns)[:, ::-1])]
 
 

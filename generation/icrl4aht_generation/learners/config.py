@@ -111,5 +111,5 @@ class PPOConfig:
 
     @property
     def episodes(self) -> int:
-        """Number of episodes per environment whose stored steps and the state after them lie within the updates."""
+        """Number of episodes per environment that can be stored, with the state after their last stored step."""
         return max(0, (self.updates * self.rollout - KEPT_STEPS - 1) // EPISODE_STEPS + 1)

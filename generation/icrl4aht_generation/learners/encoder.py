@@ -83,7 +83,7 @@ class CompactView:
     Attributes:
         kind: kind of the encoder.
         layouts: layouts of the records.
-        agents: agents whose observations are encoded, see `CellWords.entries`; records have the observing agent first.
+        agents: observing agents, 0 (ego) or 1 (teammate). In each record, the observing agent comes first.
         canonical: whether observations have the canonical channels instead of the layouts' channels.
     """
 

@@ -315,7 +315,7 @@ class TestHeldOut:
             assert {cell["labels"] for cell in found.about["trained_on"]} == {labels}
             assert {sampler.labels for sampler in (found.data.train, *found.data.validation.values())} == {labels}
 
-    def test_options_every_and_queries_are_passed_to_samplers(self, two_sources):
+    def test_sampler_options_are_passed_on(self, two_sources):
         found = training_job(two_sources[0], context=40, every=3)
         assert {sampler.every for sampler in (found.data.train, *found.data.validation.values())} == {3}
         dpt = training_job(two_sources[0], "dpt", context=40, queries=3)

@@ -1,4 +1,4 @@
-"""Test the choice and the shipped list of teammates whose actions differ widely, and teammates with random actions."""
+"""Test how widely different teammates are chosen, the package's list of them, and teammates with random actions."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def _step_to_middle(scene: Scene) -> Int[Array, ""]:
 
 
 def _rule_action(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> Int[Array, ""]:
-    """Return the action of all modes except BLOCKER, by rules in order of priority."""
+    """Return the action in a mode other than BLOCKER; the first of the rules that applies decides."""
     empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
     hoards, counters = params["behavior_mode"] == HOARDER, params["behavior_mode"] == COUNTER
     soup, cooking, room = (jnp.any(mask) for mask in (scene.cooked, scene.cooking, scene.fillable_pot_cells))
