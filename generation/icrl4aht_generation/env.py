@@ -109,7 +109,7 @@ class Environment:
 
         Args:
             keys: typed JAX keys (N,), or raw keys, uint32 (N, 2).
-            layout: number of each environment's layout; by default all layouts in turn. Ignored with only one layout,
+            layout: index of each environment's layout; by default all layouts in turn. Ignored with only one layout,
                 and if layouts are redrawn.
         """
         if not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):

@@ -42,7 +42,7 @@ def check_index(
     Args:
         index: the release's index.
         tasks: the release's tasks.
-        played: the release's tasks, with a copy of the task for each further teammate that plays in it.
+        played: the release's tasks; a task with several teammates appears once for each teammate.
         provenance: task id -> record of how the task's histories were made; None if unreadable.
         report: receives the problems.
     """

@@ -24,7 +24,7 @@ LabelView = Literal["ego", "state"]
 """Input of the policy that chose the expert actions, see `facts.LABEL_VIEWS`."""
 
 
-class StreamReturns(Struct, frozen=True, omit_defaults=True):
+class MeanStreamReturns(Struct, frozen=True, omit_defaults=True):
     """Mean returns of streams; a stream is all recorded episodes of one parallel environment of a learner.
 
     Args:
@@ -47,8 +47,8 @@ class StreamFilter(Struct, frozen=True, omit_defaults=True):
         least_improvement: minimum improvement of the return of a stream in the release; None if there was no minimum.
     """
 
-    before: StreamReturns
-    after: StreamReturns
+    before: MeanStreamReturns
+    after: MeanStreamReturns
     least_improvement: FiniteNumber | None = None
 
 

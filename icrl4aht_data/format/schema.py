@@ -237,7 +237,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return tuple(field for field in FIELDS.values() if kind not in field.absent and self._has_stored(field))
 
     def has(self, field: Field) -> bool:
-        """Return whether the history has an optional field, see `Field.optional`; True for other fields."""
+        """Return whether the history has this field; always True for fields that are not `optional`."""
         return self._has_stored(self.stored_field(field))
 
     def stored_field(self, field: Field) -> Field:

@@ -223,7 +223,7 @@ def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None
     """Copy array[first[i] : first[i] + K] to out[i] as one block; `out`, of shape (n, K, ...), is C-contiguous."""
     size = array[0].size
     flat, width = array.reshape(-1), out.shape[1] * size
-    # `np.ndarray` makes this view of all windows 20 microseconds faster than `sliding_window_view`.
+    # Creating this view of all windows takes 20 microseconds less with `np.ndarray` than with `sliding_window_view`.
     blocks = np.ndarray((flat.size - width + 1, width), flat.dtype, flat, strides=flat.strides * 2)
     offset, target = first * size, out.reshape(len(out), -1)
     windows = max(1, _COPIED // (width * flat.itemsize))

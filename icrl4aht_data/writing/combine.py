@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.provenance import Provenance, StreamReturns
+from icrl4aht_data.format.provenance import MeanStreamReturns, Provenance
 from icrl4aht_data.writing.convert import release_tasks, stored_task
 from icrl4aht_data.writing.release import NewTask, write_release
 
@@ -97,4 +97,4 @@ def _partial_provenance(made: Provenance, histories: Dataset) -> Provenance:
     if made.filter is None:
         return replace(made, streams_kept=kept)
     start, end = (round(float(histories.column(name).mean()), 3) for name in ("return_start", "return_end"))
-    return replace(made, streams_kept=kept, filter=replace(made.filter, after=StreamReturns(kept, start, end)))
+    return replace(made, streams_kept=kept, filter=replace(made.filter, after=MeanStreamReturns(kept, start, end)))

@@ -262,7 +262,7 @@ def test_given_tasks_keep_their_recorded_sources(changed):
         (third, "ppo", 1),
     ]
     of_ppo = load_profile(changed("keep = 8", "keep = 7"))
-    with pytest.raises(OptionError, match=rf"task {second}: the source is noise, but profile mine has ppo: "):
+    with pytest.raises(OptionError, match=rf"task {second}: the source is noise, but profile mine only has ppo: "):
         of_ppo.units_of(tasks, {second: "noise"})
 
 

@@ -60,7 +60,7 @@ class BundledModel(NamedTuple):
     date: str = ""
 
     def run_key(self, layout: str) -> str:
-        """Return the key in `runs` of the run for the layout with this short name."""
+        """Return the key of a layout's run in `runs`; `layout` is the layout's short name."""
         return EVERY_TRACK if EVERY_TRACK in self.runs else layout_track(layout)
 
 

@@ -418,7 +418,7 @@ class PlayTrainer:
         return nullcontext(range(start, stop))
 
     def validation_lines(self, state: PlayState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
-        """Return no lines, because models that play are compared by `evaluate` on validation tasks."""
+        """Return an empty list, because models that play have no validation losses; use `evaluate` instead."""
         return []
 
     def step(self, state: PlayState, number: int) -> tuple[PlayState, dict[str, Array]]:

@@ -313,7 +313,7 @@ def write_page(
         values = _page_values(runs, episodes, notes if shown and left else [])
         text = _template_environment().get_template("page.html").render(values)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, text.lstrip())  # `check_output` knows a page by its first bytes
+    write_atomically(path, text.lstrip())  # `check_output` recognizes a page by its first bytes
     return path
 
 

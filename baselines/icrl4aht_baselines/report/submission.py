@@ -182,8 +182,8 @@ def check_submission(found: Submission, where: str) -> None:
             )
     if not found.update and not any(one.control == "" for one in found.evaluations):
         raise OptionError(
-            f"{where}: expected results of the agent itself, found only controls or another play mode; give the "
-            f"folder of the agent's results as well, or --update if the page already has these results"
+            f"{where}: found only results of controls or of greedy or sampled actions, but none of the "
+            f"agent's own play; also give the folder with them, or --update if the page already has them"
         )
 
 

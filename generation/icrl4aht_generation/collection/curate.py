@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.format.provenance import StreamFilter, StreamReturns
+from icrl4aht_data.format.provenance import MeanStreamReturns, StreamFilter
 from icrl4aht_data.format.schema import curve_ends, stream_score
 from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.layouts import Layout
@@ -75,7 +75,7 @@ def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: floa
     sides = []
     for part in (before, after):
         start, end = (round(float(values.mean()), 3) for values in curve_ends(part))
-        sides.append(StreamReturns(len(part), start, end))
+        sides.append(MeanStreamReturns(len(part), start, end))
     return StreamFilter(before=sides[0], after=sides[1], least_improvement=least_improvement)
 
 

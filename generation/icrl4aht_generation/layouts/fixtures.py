@@ -23,7 +23,7 @@ LayoutDraw = tuple[tuple[str, ...], tuple[tuple[int, int, int], ...], bool]
 """Arguments of a `Layout` after its names: map, recipes, and whether the layout has a delivery indicator."""
 
 _INGREDIENT_IDS = 4  # ingredients 0 to 3 have canonical channels
-_MOST = {"P": 3, "L": 2}  # maximum number of copies of pots and buttons; other fixtures have no limit
+_MOST = {"P": 3, "L": 2}  # maximum numbers of pots and of buttons; other fixtures have no limit
 _ARRANGEMENTS = 60  # maximum number of tries to place the chosen fixtures
 
 

@@ -263,7 +263,7 @@ class Profile:
             source = sources.get(task.task_id, self.sources[0])
             if source not in self.sources:
                 raise OptionError(
-                    f"task {task.task_id}: the source is {source}, but profile {self.name} has "
+                    f"task {task.task_id}: the source is {source}, but profile {self.name} only has "
                     f"{', '.join(self.sources)}: choose a profile with this source, or remove the task"
                 )
             units += self._work_units([task], source)

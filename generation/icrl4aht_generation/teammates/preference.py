@@ -41,7 +41,7 @@ def all_dishes(layout: Layout) -> list[Dish]:
 
 
 def training_dishes(layout: Layout) -> list[Dish]:
-    """Return the dishes of training and validation tasks on a layout: all of 4 dishes, or 7 of 10 dishes."""
+    """Return the dishes of training and validation tasks on a layout: all if it has 4 dishes, 7 if it has 10."""
     dishes = all_dishes(layout)
     return [dish for number, dish in enumerate(dishes) if len(dishes) < 10 or number % 3 != 2]
 

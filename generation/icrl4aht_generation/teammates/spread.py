@@ -249,7 +249,7 @@ def spread_rows(spreads: Iterable[LayoutSpread]) -> list[dict[str, Any]]:
 
 
 def spread_candidates() -> list[dict[str, Any]]:
-    """Return the entries of all candidates by family: presets, specialists, diverse sampled teammates, mixtures."""
+    """Return all candidates, sorted by family: presets, specialists, diverse sampled teammates, mixtures."""
     return [entry for family in HEURISTIC_FAMILIES for entry in _family_candidates(family)]
 
 

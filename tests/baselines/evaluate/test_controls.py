@@ -68,7 +68,7 @@ def compiled_programs():
 
 @pytest.fixture(scope="module")
 def solo_returns(compiled_programs):
-    """Return the returns of an ego that stays and of one that acts randomly, each of shape (tasks, episodes)."""
+    """Play with an ego that stays and with a random one; give the returns of each, of shape (tasks, episodes)."""
 
     def play(mode):
         results = evaluate("fixed", ego(mode), TASKS, FOUR, programs=compiled_programs)
@@ -103,7 +103,7 @@ def test_memory_and_partner_controls_equal_hand_computed_differences(solo_return
 
 
 def test_control_intervals_treat_equal_behaviours_as_one_unit():
-    """With one seed, five H4 teammates of equal behaviour give no interval; five different H3 teammates do."""
+    """With one seed, five teammates of H4 that behave the same have no interval; different teammates of H3 do."""
     tasks = [task for task in published_tasks("teammate") if task.layout.name == "coord_simple"]
     values = np.arange(4.0)
     for family in ("H4", "H3"):

@@ -107,7 +107,7 @@ def test_layout_numbers_of_a_batch_determine_how_views_are_changed():
 
 
 def test_mirrored_batches_have_mirrored_actions():
-    """A mirrored batch contains mirrored actions; its layout numbers say how each window is mirrored."""
+    """Mirroring a batch also mirrors its actions; the number in `layouts` encodes how each window is mirrored."""
     dataset = load_icrl4aht(layout=["asymm_both", "demo_wide"], split="train", obs="state", channels="canonical")
     layouts = [*reversed(dataset.layouts)]
     sampler = dataset.ad(batch_size=64, length=40, seed=3, labels="expert", teammate_actions=True)

@@ -96,7 +96,7 @@ def play(run: Any) -> JoinedRollouts:
 
 
 @pytest.fixture(scope="module")
-def played() -> JoinedRollouts:
+def joined_rollouts() -> JoinedRollouts:
     return play(scripted_rollout)
 
 
@@ -137,25 +137,25 @@ def policy_params(params: Any, policy: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[policy], params)
 
 
-def test_actions_of_players_reach_their_agent_slots(played):
-    np.testing.assert_array_equal(played.rollout.actions, expected_actions(played.rollout.record))
-    for choice, slots in zip(played.rollout.choices, SLOTS, strict=True):
+def test_actions_of_players_reach_their_agent_slots(joined_rollouts):
+    np.testing.assert_array_equal(joined_rollouts.rollout.actions, expected_actions(joined_rollouts.rollout.record))
+    for choice, slots in zip(joined_rollouts.rollout.choices, SLOTS, strict=True):
         agent, env = np.divmod(slots, ENVS)
-        np.testing.assert_array_equal(choice.action, played.rollout.actions[:, env, agent])
+        np.testing.assert_array_equal(choice.action, joined_rollouts.rollout.actions[:, env, agent])
 
 
-def test_roll_out_equals_single_steps_of_the_environment(played):
+def test_roll_out_equals_single_steps_of_the_environment(joined_rollouts):
     """Compare a rollout with a loop over steps of the environment."""
     step = jax.jit(ENV.step)
-    state = played.start.env
-    for t, actions in enumerate(played.rollout.actions):
-        np.testing.assert_array_equal(played.rollout.record[t], state.record)
+    state = joined_rollouts.start.env
+    for t, actions in enumerate(joined_rollouts.rollout.actions):
+        np.testing.assert_array_equal(joined_rollouts.rollout.record[t], state.record)
         outcome = step(state, actions)
-        np.testing.assert_array_equal(played.rollout.reward[t], outcome.reward)
-        np.testing.assert_array_equal(played.rollout.shaped[t], outcome.shaped)
-        np.testing.assert_array_equal(played.rollout.done[t], outcome.done)
+        np.testing.assert_array_equal(joined_rollouts.rollout.reward[t], outcome.reward)
+        np.testing.assert_array_equal(joined_rollouts.rollout.shaped[t], outcome.shaped)
+        np.testing.assert_array_equal(joined_rollouts.rollout.done[t], outcome.done)
         state = outcome.state
-    np.testing.assert_array_equal(played.carry.env.record, state.record)
+    np.testing.assert_array_equal(joined_rollouts.carry.env.record, state.record)
 
 
 @pytest.mark.parametrize("batch", [(), (3,)])
@@ -185,7 +185,7 @@ def test_players_restart_only_in_environments_whose_episode_ended():
         np.testing.assert_array_equal(notes.steps, (clock[slots % ENVS] + STEPS) % EPISODE)
 
 
-def test_returns_add_up_rewards_of_an_episode_across_rollouts(played):
+def test_returns_add_up_rewards_of_an_episode_across_rollouts(joined_rollouts):
     """The environment's rewards are replaced by synthetic ones, since scripted play earns few rewards."""
 
     class SyntheticRewards(Environment):
@@ -193,7 +193,7 @@ def test_returns_add_up_rewards_of_an_episode_across_rollouts(played):
             return super().step(state, actions)._replace(reward=(actions.sum(axis=1) + state.clock).astype(jnp.float32))
 
     run = jax.jit(lambda carry, key: roll_out(SyntheticRewards(LAYOUT, EPISODE), PLAYERS, carry, STEPS, key))
-    middle, first = run(played.start, jax.random.key(1))
+    middle, first = run(joined_rollouts.start, jax.random.key(1))
     after, second = run(middle, jax.random.key(2))
     reward, returns = (
         np.concatenate([a, b]) for a, b in ((first.reward, second.reward), (first.returns, second.returns))
@@ -204,8 +204,8 @@ def test_returns_add_up_rewards_of_an_episode_across_rollouts(played):
     np.testing.assert_array_equal(after.returns, reward[15])
 
 
-def test_restart_hook_changes_only_first_states_of_episodes(played, played_with_hook):
-    first, rollout = played.rollout.record, played_with_hook.rollout
+def test_restart_hook_changes_only_first_states_of_episodes(joined_rollouts, played_with_hook):
+    first, rollout = joined_rollouts.rollout.record, played_with_hook.rollout
     # The hook is not called before the first episode.
     np.testing.assert_array_equal(rollout.record[:EPISODE], first[:EPISODE])
     for start in (5, 10, 15):

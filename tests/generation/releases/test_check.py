@@ -21,7 +21,7 @@ def test_check_reports_equal_folders_as_bit_equal(built):
     assert f"{built / 'a'}: made with {xla_threads()} XLA thread" in printed
 
 
-def test_check_reports_different_numbers_of_threads(tmp_path):
+def test_check_reports_that_numbers_of_threads_differ(tmp_path):
     for name, records in (("a", {"t0": {"xla_threads": 1}, "t1": {"xla_threads": 2}}), ("b", {"t0": {}})):
         (tmp_path / name / "meta").mkdir(parents=True)
         (tmp_path / name / "meta/provenance.json").write_text(json.dumps(records))

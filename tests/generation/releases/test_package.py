@@ -206,7 +206,7 @@ def test_noise_histories_are_labelled_by_their_scripted_ego(built, profile, tmp_
     assert recorded_sources(root) == {task.task_id: "noise"}
     assert recorded_sources(tmp_path) == {}
     arguments = ["--profile", built / "tiny.toml", "--tasks", root / "meta/tasks.jsonl", "--out", tmp_path / "out"]
-    with pytest.raises(OptionError, match=f"task {task.task_id}: the source is noise, but profile tiny has ppo"):
+    with pytest.raises(OptionError, match=f"task {task.task_id}: the source is noise, but profile tiny only has ppo"):
         run_cli("generate", *arguments)
     without = package_tasks(tmp_path, replace(both, oracle_actions=False), [work], {task.task_id: MATTERS})
     assert not any(entry.has_oracle_actions for entry in load_icrl4aht(without).entries)

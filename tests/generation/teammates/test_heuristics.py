@@ -148,7 +148,7 @@ def test_random_numbers_equal_those_of_the_published_code():
         np.testing.assert_allclose(u, np.array(expected, float), atol=5e-7)
 
 
-def key_of(memory: Any) -> jax.Array:
+def noise_key(memory: Any) -> jax.Array:
     """Return the random key in the memory of a heuristic; H3's memory consists of the key."""
     return getattr(memory, "key", memory)
 
@@ -158,8 +158,8 @@ def test_fixed_noise_ignores_the_episode_key_unlike_seeded_noise(family):
     for slot in (0, 1):
         teammate = heuristic_teammate(family, "default", 0)
         fixed, seeded = (build_teammate(LAYOUTS["cramped_up"], teammate, slot, noise) for noise in get_args(Noise))
-        assert key_of(fixed.init(fixed.params, jax.random.key(123))) == jax.random.key(slot)
-        assert key_of(seeded.init(seeded.params, jax.random.key(123))) == jax.random.key(123)
+        assert noise_key(fixed.init(fixed.params, jax.random.key(123))) == jax.random.key(slot)
+        assert noise_key(seeded.init(seeded.params, jax.random.key(123))) == jax.random.key(123)
 
 
 ROWS = 48

@@ -49,7 +49,7 @@ def test_word_entries_include_every_nonzero_entry_of_observations(layout):
 
 
 @pytest.mark.parametrize("canonical", [False, True], ids=["own", "canonical"])
-def test_words_of_several_layouts_in_one_batch_equal_observations(canonical):
+def test_cell_words_of_several_layouts_in_one_batch_give_the_observations(canonical):
     """Mix four layouts with equal channels, or all layouts with canonical channels."""
     names = LAYOUTS if canonical else ("asymm_both", "cramped_up", "asymm_right", "cramped_down")
     layouts = tuple(map(get_layout, names))

@@ -122,7 +122,7 @@ class TestMissingLabels:
 
 
 def test_weak_oracle_labels_cause_a_warning(two_sources, monkeypatch):
-    """The oracle earns 5 in all tasks, and the test sets the final return of all histories to 11."""
+    """The oracle's return is 5 in each task, and every history is given a final return of 11."""
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", source="ppo")
     column = type(dataset).column
 

@@ -1,4 +1,4 @@
-"""Test `check_output`: files are replaced only on request and by files of their kind; links and folders never."""
+"""Test `check_output`: a file is replaced only on request, by a file of the same kind; links and folders never are."""
 
 from __future__ import annotations
 

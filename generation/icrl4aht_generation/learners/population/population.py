@@ -68,7 +68,7 @@ class Assignment(NamedTuple):
 
     @property
     def partner(self) -> np.ndarray:
-        """Policy of the other agent in each slot's environment, an int array of shape (2 N,)."""
+        """Number of the other agent's policy, for each agent of each environment; an int array of shape (2 N,)."""
         return self.policy[::-1].ravel()
 
     @property
