@@ -92,6 +92,10 @@ def _load_script(path: Path) -> dict[str, Any]:
     silent.main = lambda **_: lambda function: function
     silent.log = lambda metric: None
     silent.OmegaConf = None
-    for name in ("hydra", "omegaconf", "wandb"):
-        sys.modules.setdefault(name, silent)
-    return runpy.run_path(str(path))
+    stubs = {"hydra", "omegaconf", "wandb"} - sys.modules.keys()
+    sys.modules.update(dict.fromkeys(stubs, silent))
+    try:
+        return runpy.run_path(str(path))
+    finally:
+        for name in stubs:
+            del sys.modules[name]

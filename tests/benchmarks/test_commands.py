@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from functools import partial
 from typing import Any
 
@@ -83,7 +84,9 @@ def test_jaxmarl_script_is_run_with_both_environments(tmp_path, monkeypatch):
     script = tmp_path / "ippo.py"
     script.write_text(SCRIPT)
     options = ["--layout", "cramped_up", "--environments", "2", "--rollout", "4", "--rounds", "1", "--peer", script]
+    before = [sys.modules.get(name) for name in ("hydra", "omegaconf", "wandb")]
     printed = run_cli(*options, program=bench_env.main).splitlines()
+    assert [sys.modules.get(name) for name in ("hydra", "omegaconf", "wandb")] == before
     *said, last = [line for line in printed if line.startswith(("training", "{"))]
     assert said == ["training icrl4aht_cramped_up 80 2", "training Overcooked V2 80 2"]
     check_ratio(json.loads(last), "jaxmarl")

@@ -275,15 +275,16 @@ QUICK_OPTIONS = {
     "train": "--steps 2 --batch-size 2 --context 20 --width 16 --heads 2",
     "evaluate": "--tasks 1 --episodes 2",
     "generate": "--profile tiny.toml",
-    "release": "",
+    "release": "build/smoke/lite",
 }
-"""Command of the README -> options that shorten it, given after the options that the README shows."""
+"""Command of the README -> arguments that shorten it, given after the arguments that the README shows."""
 
 
-def test_the_five_commands_of_the_readme_run_after_its_install_command(wheel, tmp_path):
+def test_the_five_commands_of_the_readme_run_after_its_install_command(jax_environment, wheel, tmp_path):
+    """The environment also has the extra `jax`, which the README's extras include."""
     (extras,) = re.findall(r"^pip install '\.(\[.*?\])'", README, re.MULTILINE)
-    version = f"{sys.version_info.major}.{sys.version_info.minor}"
-    run = command_runner(make_environment(version, tmp_path / "env", f"{NAME}{extras} @ {wheel.as_uri()}"), tmp_path)
+    install_packages(jax_environment / "python", f"{NAME}{extras} @ {wheel.as_uri()}")
+    run = command_runner(jax_environment, tmp_path)
     (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")
     calls = shell_calls(README.partition("## Five commands")[2])
     assert [arguments[0] for arguments in calls] == list(QUICK_OPTIONS)
