@@ -185,12 +185,13 @@ class _Player:
         self._partners = jnp.array([task.partner for task in tasks], jnp.int32) if informed else None
         # Without changed views, the code for them is left out, which saves time in every step and in compilation.
         self._changes = mirror or bool(self._hidden.any())
+        self._compact = _observation_filter(method, tasks, mirror)
         layouts = list(dict.fromkeys(task.layout for task in tasks))
         number = {layout: position for position, layout in enumerate(layouts)}
         several = len(layouts) > 1
         self.rollout = EvaluationRollout(
             layouts if several else layouts[0],
-            _model_policy(method, self._changes),
+            _model_policy(method, self._changes, self._compact),
             [task.teammate for task in tasks],
             get_protocol("seeded"),
             np.array([number[task.layout] for task in tasks]) if several else None,
@@ -276,6 +277,7 @@ class _Player:
             # Only the first step of `steps` can be the first step of a task.
             started = jnp.ones((len(record) + 1, len(self.tasks)), bool).at[0].set(state.ego.started)
             steps = seen_steps(change, steps, started)
+        steps = steps._replace(obs=self._compact(steps.obs))
         # Log-probabilities and values are computed again with the operations of the loss, so that both agree exactly.
         _, logits, value = _Network(self._method.model).apply(params, state.ego.state, steps)
         action = change.actions(taken)
@@ -330,8 +332,22 @@ def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"])
     )
 
 
-def _model_policy(method: Method, changes: bool) -> Policy:
-    """Return the policy that samples the model's actions in training; `changes` alter the observations."""
+def _observation_filter(method: Method, tasks: Sequence[PlayTask], mirror: bool) -> Callable[[Array], Any]:
+    """Return a function that removes entries of observations that are always 0, which makes the encoder faster.
+
+    The function returns observations unchanged if they may have entries that the encoder's view does not have, because
+    tasks are mirrored or on other layouts than those of the view.
+    """
+    view = method.model.tokens.encoder.view
+    covered = view is not None and {task.layout for task in tasks} <= {*view.layouts}
+    return view.compact if covered and not mirror else lambda obs: obs
+
+
+def _model_policy(method: Method, changes: bool, compact: Callable[[Array], Any]) -> Policy:
+    """Return the policy that samples the model's actions in training; `changes` alter the observations.
+
+    `compact` converts observations to the encoder's input.
+    """
 
     def init(params: Any, key: Array) -> PlayerMemory:
         return PlayerMemory(no_change(), method.start(0, True), jnp.bool_(False))
@@ -339,6 +355,7 @@ def _model_policy(method: Method, changes: bool) -> Policy:
     def act(params: Any, memory: PlayerMemory, ego_input: Any, key: Array) -> tuple[Array, PlayerMemory]:
         step = input_step(ego_input)._replace(partner=memory.partner)
         step = seen_steps(memory.change, step, memory.started) if changes else step
+        step = step._replace(obs=compact(step.obs))
         logits, state = method.act(params, step, ego_input.prev_done, memory.state)
         action = jax.random.categorical(key, logits).astype(jnp.int32)
         return memory.change.actions(action), memory._replace(state=state, started=jnp.bool_(True))

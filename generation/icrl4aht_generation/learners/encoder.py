@@ -117,7 +117,11 @@ class CompactView:
         else:
             obs = jnp.asarray(self.words.channels)[self.words.ids(record, layout_number)]
             obs = obs.reshape(*batch, WINDOW, WINDOW, self.channels)
-        return obs if self.kind == "paper" else WindowEntries(obs.reshape(*batch, -1)[..., self.entries])
+        return self.compact(obs)
+
+    def compact(self, obs: Num[Array, "*B 5 5 C"]) -> Seen:
+        """Convert observations to `WindowEntries` for `mlp`, and return them unchanged for other kinds of encoder."""
+        return WindowEntries(obs.reshape(*obs.shape[:-3], -1)[..., self.entries]) if self.kind == "mlp" else obs
 
     def observations(self, seen: Seen) -> Num[Array, "*B 5 5 C"]:
         """Convert an encoder's input back to observations."""
