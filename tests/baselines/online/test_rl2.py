@@ -24,6 +24,7 @@ from icrl4aht_baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
     PlayTask,
     PlayTrainer,
+    _observation_filter,
     make_play_tasks,
     make_players,
     seen_steps,
@@ -41,11 +42,13 @@ from icrl4aht_generation.teammates.registry import build_teammate, sample_teamma
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, teammate_id
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, OptionError
-from icrl4aht_data.overcooked.actions import STAY
+from icrl4aht_data.overcooked.actions import EGO, STAY
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import initial_record
 from tests.helpers.commands import run_cli
 from tests.helpers.spoiled import read_lines
+from tests.helpers.states import random_records
 
 LAYOUT = get_layout("cramped_up")
 MODEL = ModelOptions(width=16, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05)
@@ -180,6 +183,18 @@ def test_previous_actions_of_a_first_step_are_not_mirrored():
     seen = seen_steps(change, steps, jnp.array([False, True]))
     assert seen.prev_action.tolist() == [0, 1]
     assert seen.prev_teammate_action is not None and seen.prev_teammate_action.tolist() == [0, 1]
+
+
+def test_entries_are_removed_only_from_observations_of_the_encoders_layouts():
+    """Entries that are always 0 are removed unless tasks are mirrored or on other layouts than those of the encoder."""
+    (mate,), other = teammates(1).values(), get_layout("demo_wide")
+    here, elsewhere = (PlayTask(layout, "a", mate, False, layout.name) for layout in (LAYOUT, other))
+    obs = observe(LAYOUT, random_records(LAYOUT, 400, np.random.default_rng(0)), EGO, canonical=True)
+    found = _observation_filter(METHOD, [here], False)(obs)
+    assert 0 < found.values.shape[-1] < obs[0].size / 2
+    np.testing.assert_array_equal(METHOD.model.tokens.encoder.view.observations(found), obs)
+    for tasks, mirror in (([here], True), ([here, elsewhere], False)):
+        assert _observation_filter(METHOD, tasks, mirror)(obs) is obs
 
 
 @pytest.mark.slow
