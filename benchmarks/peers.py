@@ -93,7 +93,7 @@ def _load_script(path: Path) -> dict[str, Any]:
     silent.log = lambda metric: None
     silent.OmegaConf = None
     stubs = {"hydra", "omegaconf", "wandb"} - sys.modules.keys()
-    sys.modules.update(dict.fromkeys(stubs, silent))
+    sys.modules.update((name, silent) for name in stubs)
     try:
         return runpy.run_path(str(path))
     finally:

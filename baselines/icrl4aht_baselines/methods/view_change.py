@@ -17,7 +17,7 @@ import numpy as np
 from icrl4aht_generation.learners.encoder import CompactView
 from jaxtyping import Array, Bool, Int, Num
 
-from icrl4aht_baselines.methods.tokens import BatchView
+from icrl4aht_baselines.methods.tokens import BatchView, StepInput
 from icrl4aht_data.overcooked.actions import DOWN, INTERACT, LEFT, RIGHT, STAY, UP
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS
 from icrl4aht_data.overcooked.layouts import Layout
@@ -63,6 +63,24 @@ class ViewChange(NamedTuple):
     def actions(self, actions: Int[Array, "*B"]) -> Int[Array, "*B"]:
         """Convert actions from the environment to the ego's view, or from the ego's view to the environment."""
         return jnp.asarray(_MIRRORED_ACTIONS, actions.dtype)[self.upside_down + 2 * self.sideways, actions]
+
+    def steps(self, steps: StepInput, started: Bool[Array, "*B"]) -> StepInput:
+        """Return steps with changed observations, and with previous actions converted to the changed view.
+
+        Args:
+            steps: steps with the environment's observations (*B, ..); the changes may have fewer leading axes.
+            started: whether each step has a previous step in its task; if not, previous actions are fillers and stay 0.
+        """
+
+        def view_actions(actions: Array) -> Array:
+            return jnp.where(started, self.actions(actions), actions)
+
+        mate = steps.prev_teammate_action
+        return steps._replace(
+            obs=self.observations(steps.obs),
+            prev_action=view_actions(steps.prev_action),
+            prev_teammate_action=None if mate is None else view_actions(mate),
+        )
 
 
 def _exchange_directions(obs: Array, one: str, other: str) -> Array:

@@ -185,8 +185,8 @@ class _Player:
         self._partners = jnp.array([task.partner for task in tasks], jnp.int32) if informed else None
         # Without changed views, the code for them is left out, which saves time in every step and in compilation.
         self._changes = mirror or bool(self._hidden.any())
-        self._compact = _observation_filter(method, tasks, mirror)
         layouts = list(dict.fromkeys(task.layout for task in tasks))
+        self._compact = _observation_filter(method, layouts, self._changes)
         number = {layout: position for position, layout in enumerate(layouts)}
         several = len(layouts) > 1
         self.rollout = EvaluationRollout(
@@ -276,7 +276,7 @@ class _Player:
         if self._changes:
             # Only the first step of `steps` can be the first step of a task.
             started = jnp.ones((len(record) + 1, len(self.tasks)), bool).at[0].set(state.ego.started)
-            steps = seen_steps(change, steps, started)
+            steps = change.steps(steps, started)
         steps = steps._replace(obs=self._compact(steps.obs))
         # Log-probabilities and values are computed again with the operations of the loss, so that both agree exactly.
         _, logits, value = _Network(self._method.model).apply(params, state.ego.state, steps)
@@ -312,35 +312,16 @@ def make_players(tasks: Sequence[PlayTask], method: Method, play: PlayOptions, m
     return [_Player(own, method, play, mirror) for own in grouped(tasks, program).values()]
 
 
-def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"]) -> StepInput:
-    """Return steps with changed observations, and with previous actions converted to the changed view.
-
-    Args:
-        change: changes of the observations, of shape (*B,); leading axes of *B may be left out if changes are equal.
-        steps: steps with the environment's observations (*B, ..).
-        started: whether each step has a previous step in its task; if not, previous actions are fillers and stay 0.
-    """
-
-    def view_actions(actions: Array) -> Array:
-        return jnp.where(started, change.actions(actions), actions)
-
-    mate = steps.prev_teammate_action
-    return steps._replace(
-        obs=change.observations(steps.obs),
-        prev_action=view_actions(steps.prev_action),
-        prev_teammate_action=None if mate is None else view_actions(mate),
-    )
-
-
-def _observation_filter(method: Method, tasks: Sequence[PlayTask], mirror: bool) -> Callable[[Array], Any]:
+def _observation_filter(method: Method, layouts: Collection[Layout], changes: bool) -> Callable[[Array], Any]:
     """Return a function that removes entries of observations that are always 0, which makes the encoder faster.
 
     The function returns observations unchanged if they may have entries that the encoder's view does not have, because
-    tasks are mirrored or on other layouts than those of the view.
+    `changes` alter the observations, or the view does not have all layouts.
     """
     view = method.model.tokens.encoder.view
-    covered = view is not None and {task.layout for task in tasks} <= {*view.layouts}
-    return view.compact if covered and not mirror else lambda obs: obs
+    if changes or view is None or not {*layouts} <= {*view.layouts}:
+        return lambda obs: obs
+    return view.compact
 
 
 def _model_policy(method: Method, changes: bool, compact: Callable[[Array], Any]) -> Policy:
@@ -354,7 +335,7 @@ def _model_policy(method: Method, changes: bool, compact: Callable[[Array], Any]
 
     def act(params: Any, memory: PlayerMemory, ego_input: Any, key: Array) -> tuple[Array, PlayerMemory]:
         step = input_step(ego_input)._replace(partner=memory.partner)
-        step = seen_steps(memory.change, step, memory.started) if changes else step
+        step = memory.change.steps(step, memory.started) if changes else step
         step = step._replace(obs=compact(step.obs))
         logits, state = method.act(params, step, ego_input.prev_done, memory.state)
         action = jax.random.categorical(key, logits).astype(jnp.int32)

@@ -27,7 +27,6 @@ from icrl4aht_baselines.online.rl2 import (
     _observation_filter,
     make_play_tasks,
     make_players,
-    seen_steps,
 )
 from icrl4aht_baselines.online.teammates import BEHAVIOURS, MIXTURE, mixed_chances, with_behaviours
 from icrl4aht_baselines.training.histories import read_trained
@@ -180,21 +179,18 @@ def test_previous_actions_of_a_first_step_are_not_mirrored():
     change = ViewChange(~flags, flags, flags)
     zero = jnp.zeros(2, jnp.int32)
     steps = StepInput(jnp.zeros((2, 5, 5, 46), jnp.uint8), zero, jnp.zeros(2), zero)
-    seen = seen_steps(change, steps, jnp.array([False, True]))
+    seen = change.steps(steps, jnp.array([False, True]))
     assert seen.prev_action.tolist() == [0, 1]
     assert seen.prev_teammate_action is not None and seen.prev_teammate_action.tolist() == [0, 1]
 
 
-def test_entries_are_removed_only_from_observations_of_the_encoders_layouts():
-    """Entries that are always 0 are removed unless tasks are mirrored or on other layouts than those of the encoder."""
-    (mate,), other = teammates(1).values(), get_layout("demo_wide")
-    here, elsewhere = (PlayTask(layout, "a", mate, False, layout.name) for layout in (LAYOUT, other))
+def test_entries_are_removed_only_from_unchanged_observations_of_the_encoders_layouts():
     obs = observe(LAYOUT, random_records(LAYOUT, 400, np.random.default_rng(0)), EGO, canonical=True)
-    found = _observation_filter(METHOD, [here], False)(obs)
+    found = _observation_filter(METHOD, [LAYOUT], False)(obs)
     assert 0 < found.values.shape[-1] < obs[0].size / 2
     np.testing.assert_array_equal(METHOD.model.tokens.encoder.view.observations(found), obs)
-    for tasks, mirror in (([here], True), ([here, elsewhere], False)):
-        assert _observation_filter(METHOD, tasks, mirror)(obs) is obs
+    for layouts, changes in (([LAYOUT], True), ([LAYOUT, get_layout("demo_wide")], False)):
+        assert _observation_filter(METHOD, layouts, changes)(obs) is obs
 
 
 @pytest.mark.slow

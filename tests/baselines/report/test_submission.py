@@ -79,7 +79,7 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: one["settings"].update(seeds=[0, 1]), r"seeds \[0, 1\], expected \[0, 1, 2\]"),
         (lambda c, one, task: one["returns"][task].pop(), r"has 2 lists of \[100\] returns, expected 3 of 100"),
         (lambda c, one, task: one["settings"]["protocol"].update(name="published"), "protocol {'name': 'published'"),
-        (lambda c, one, task: c.update(evaluations=c["evaluations"][2:]), "found only controls"),
+        (lambda c, one, task: c.update(evaluations=c["evaluations"][2:]), "found only results of controls"),
         (lambda c, one, task: one["settings"]["details"].update(forget=True), "found control cleared, expected none"),
         (lambda c, one, task: c["evaluations"][2]["settings"]["details"].clear(), "control none, expected cleared"),
         (lambda c, one, task: c["facts"].update(data=""), "Expected `str` of length >= 1 - at `\\$.facts.data`"),
