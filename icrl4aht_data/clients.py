@@ -116,8 +116,8 @@ class HubClient:
         from huggingface_hub import hf_hub_download
         from huggingface_hub.utils import tqdm
 
-        class Bar(tqdm):
-            """Hidden progress bar that reports received bytes to `count`."""
+        class HiddenBar(tqdm):
+            """Progress bar that shows nothing and reports received bytes to `count`."""
 
             def __init__(self, *args: Any, **options: Any) -> None:
                 super().__init__(*args, **options | {"disable": True})
@@ -128,7 +128,7 @@ class HubClient:
 
         options: dict[str, Any] = {"repo_type": "dataset", "revision": self.revision, "local_dir": scratch}
         is_offline = bool(offline_switches())
-        return Path(hf_hub_download(self.repo, name, **options, local_files_only=is_offline, tqdm_class=Bar))
+        return Path(hf_hub_download(self.repo, name, **options, local_files_only=is_offline, tqdm_class=HiddenBar))
 
     def sizes(self, names: list[str]) -> list[int]:
         """Return the sizes of files in bytes; 0 if the server does not report a size."""

@@ -248,7 +248,7 @@ class Dataset(Selection):
     def recover_environment(self, history_id: int, episode: int = 0, **options: Any) -> gymnasium.Env:
         """Return the Gymnasium environment of a history: the caller acts as the ego, the environment as the teammate.
 
-        Episodes have the length used to make the history, 400 steps in the benchmark; the release keeps the first 100.
+        Episodes have the length used to make the history, 400 steps in the benchmark. The release has the first 100.
         `reset(options=dataset.reset_options(history_id, episode))` repeats the start of a recorded episode.
 
         Args:

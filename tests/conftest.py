@@ -182,7 +182,7 @@ def published_folder(tmp_path_factory) -> tuple[Path, list[dict[str, np.ndarray]
 
 @pytest.fixture(scope="session")
 def converted_release(published_folder, tmp_path_factory) -> Path:
-    """Return the release of observations converted from the fixture `published_folder` (read-only)."""
+    """Return a release of kind `observations`, converted from `published_folder` (read-only)."""
     root = tmp_path_factory.mktemp("ours") / "release"
     assert from_published(published_folder[0], root, kept_steps=KEPT) == "observations"
     return root

@@ -109,7 +109,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         self.queries = check_int("queries", queries, 1)
         super().__init__(dataset, batch_size=batch_size, length=context, **options)
         check_choice("order", order, CONTEXT_ORDERS)
-        # A curriculum's part changes linearly, so it is shortest at batch 0 or at the end, as in batch 2**62.
+        # A curriculum's part of a history changes linearly: it is shortest at batch 0 or at the end, here batch 2**62.
         ranges = (map(self._count_transitions, self._draws.steps(i)) for i in (0, 2**62))
         shortest = min(int((high - low).min()) for low, high in ranges)
         if (self.length if order == "contiguous" else 1) > shortest:

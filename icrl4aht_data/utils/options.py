@@ -174,7 +174,7 @@ def check_int(name: str, value: Any, least: int) -> int:
 
 
 def check_number(name: str, value: Any, hint: Any = float) -> float:
-    """Return the value, a number of Python or NumPy, as a float after checking its bounds; see `convert_option`.
+    """Check that a number, which may be a NumPy scalar, is within bounds, and return it as a float.
 
     Raises:
         OptionError: if the value is not a finite number within the bounds; the message has the option's name.

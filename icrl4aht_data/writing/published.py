@@ -294,7 +294,7 @@ class _PublishedHistory:
     kept_steps: int
 
     @property
-    def where(self) -> str:
+    def location(self) -> str:
         """Names of the file and of the history's group, for messages."""
         return f"{self.file.filename}, group {self.line['h5_group']}"
 
@@ -320,8 +320,8 @@ class _PublishedHistory:
         missing = [name for name in dict.fromkeys(("obs", *self.field_names())) if name not in present]
         if missing:
             raise PublishedFormatError(
-                f"{self.where}: missing {', '.join(missing)}: complete the file or correct the index; if state records "
-                f"are missing, convert with `--to {OBSERVATIONS}`"
+                f"{self.location}: missing {', '.join(missing)}: complete the file or correct the index; if state "
+                f"records are missing, convert with `--to {OBSERVATIONS}`"
             )
 
     def read(self, name: str) -> np.ndarray:
@@ -338,19 +338,19 @@ class _PublishedHistory:
             try:
                 return complete_views(layout, array)
             except PublishedFormatError as error:
-                raise PublishedFormatError(f"{self.where}: obs: {error}") from error
+                raise PublishedFormatError(f"{self.location}: obs: {error}") from error
         if name in ACTION_FIELDS:
             return FROM_PUBLISHED[array]
         if name == "dones" and not (array.any() and np.array_equal(array, episode_ends(steps, self.kept_steps))):
             raise PublishedFormatError(
-                f"{self.where}: dones: expected an episode end every {self.kept_steps} steps, found {array.sum()} in "
-                f"{steps} steps, first at {np.flatnonzero(array)[:3].tolist()}; give the steps "
+                f"{self.location}: dones: expected an episode end every {self.kept_steps} steps, found {array.sum()} "
+                f"in {steps} steps, first at {np.flatnonzero(array)[:3].tolist()}; give the steps "
                 f"of an episode with --kept-steps"
             )
         if name == "state":
             obs, shown = self._read_recorded("obs"), np.empty((steps, *layout.obs_shape), np.uint8)
             if not np.array_equal(obs, fast_observe(layout, array, shown)[:, : obs.shape[1]]):
-                raise PublishedFormatError(f"{self.where}: obs does not match the observations rendered from state")
+                raise PublishedFormatError(f"{self.location}: obs does not match the observations rendered from state")
         return array
 
     def _read_recorded(self, name: str) -> np.ndarray:
@@ -358,7 +358,7 @@ class _PublishedHistory:
         field, layout, steps = FIELDS[name], get_layout(self.line["layout"]), self.line["T"]
         rows = steps if field.axis == "T" else steps // self.kept_steps
         shape = self.line["obs_shape"] if name == "obs" and self.needs_padding else field.memory_dtype(layout).shape
-        with _wrap_errors(f"{self.where}: {name}: {steps} steps on {layout.name}"):
+        with _wrap_errors(f"{self.location}: {name}: {steps} steps on {layout.name}"):
             found = read_dataset(find_node(self.file, f"{self.line['h5_group']}/{name}"), (rows, *shape))
         compact = np.dtype(field.compact)
         low, high = (0, 1) if compact.kind == "b" else (np.iinfo(compact).min, np.iinfo(compact).max)
@@ -370,6 +370,6 @@ class _PublishedHistory:
         if wrong.any():
             first = tuple(np.argwhere(wrong)[0].tolist())
             raise PublishedFormatError(
-                f"{self.where}: {name}{list(first)}: expected an integer {low}..{high}, found {found[first]}"
+                f"{self.location}: {name}{list(first)}: expected an integer {low}..{high}, found {found[first]}"
             )
         return array

@@ -164,7 +164,7 @@ def write_release(
         with (root / HISTORIES).open("w", encoding="utf-8") as stream:
             stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in writer.entries)
         named_layouts = [*(one.task.layout_name for one in new), *(one.layout for one in left_out)]
-        write_layouts_file(root / LAYOUTS_FILE, map(get_layout, named_layouts))  # not with the tasks' recipes
+        write_layouts_file(root / LAYOUTS_FILE, map(get_layout, named_layouts))  # without the tasks' own recipes
         known = [] if named else [one.task for one in new]
         write_tasks(root / TASKS, known)
         provenance = ProvenanceByTask((one.task.task_id, one.provenance) for one in new)

@@ -89,7 +89,7 @@ def test_layouts_are_drawn_uniformly_at_each_reset():
 
 
 def test_padding_does_not_change_the_tables_of_a_layout():
-    """Padded cells are walls that agents cannot face."""
+    """Cells that are added as padding are walls, and no agent can face them."""
     stacked = stack_tables(GROUP)
     for number, layout in enumerate(GROUP):
         own = make_tables(layout, stacked.pots.shape[-1], stacked.buttons.shape[-1])

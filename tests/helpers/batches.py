@@ -14,7 +14,7 @@ CACHES: tuple[CacheMode, ...] = ("ram", "mmap", "stream")
 
 
 def example_samplers(dataset, **options):
-    """Return AD and DPT samplers with different lengths and orders."""
+    """Return AD and DPT samplers with different window lengths and orders of transitions."""
     return [
         dataset.ad(batch_size=6, length=50, teammate_actions=True, **options),
         dataset.ad(batch_size=6, length=130, **options),  # windows longer than the histories

@@ -70,7 +70,7 @@ evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 evaluate --agent empty --out e | empty: expected a run folder, but config.json is missing
 evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
 evaluate --agent stay --out e --split train | unknown split 'train'; valid: test, validation
-evaluate --agent stay --out e --seed 1 --seeds 2 | --seed: cannot be used with --seeds; leave one of them out
+evaluate --agent stay --out e --seed 1 --seeds 2 | --seed: cannot be used with --seeds; leave out one or the other
 evaluate --agent stay --out e --manifest {MINI}/meta/tasks.jsonl --split test | --manifest: cannot be used with --split
 watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
 train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist

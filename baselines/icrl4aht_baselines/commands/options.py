@@ -227,7 +227,7 @@ def check_conflicts(option: str, *others: str) -> None:
     """
     source = click.get_current_context().get_parameter_source
     if given := [name for name in others if source(name) is ParameterSource.COMMANDLINE]:
-        raise click.UsageError(f"{option}: cannot be used with {_flags(given)}; leave one of them out")
+        raise click.UsageError(f"{option}: cannot be used with {_flags(given)}; leave out one or the other")
 
 
 def _flags(names: Iterable[str]) -> str:

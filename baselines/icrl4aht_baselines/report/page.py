@@ -182,7 +182,7 @@ def read_published() -> dict[str, Any]:
 
 
 def published_cells(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
-    """Return an agent's (mean, std) in the paper by layout and by family or "Average"; empty for other agents."""
+    """Return the paper's (mean, std) of an agent's returns by layout, then by family or "Average"; may be empty."""
     return read_published()["methods"].get(agent, {})
 
 

@@ -160,7 +160,7 @@ def interquartile_mean(values: Float[np.ndarray, " U"]) -> MeanInterval:
 def holm_corrected(p_values: Mapping[_Key, float]) -> dict[_Key, float]:
     """Return p-values corrected by Holm's method, which bounds the probability of any false rejection.
 
-    A p-value of NaN stays NaN and is not counted as a hypothesis.
+    A p-value of NaN stays NaN and does not count in the number of hypotheses.
     """
     keys = sorted((key for key, p in p_values.items() if not np.isnan(p)), key=lambda key: p_values[key])
     multiplied = [p_values[key] * (len(keys) - rank) for rank, key in enumerate(keys)]

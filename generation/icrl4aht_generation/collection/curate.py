@@ -65,7 +65,7 @@ def select_streams(
 
 
 def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: float | None = None) -> StreamFilter:
-    """Return the mean initial and final return of all streams (histories of environments), and of selected streams.
+    """Return the mean initial and final return of all streams, and of the selected streams.
 
     Args:
         before: episode returns of all streams, of shape (N, E).

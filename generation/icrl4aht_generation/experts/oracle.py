@@ -250,7 +250,7 @@ class OracleView:
         """Pots in front of which the ego waits instead of interacting."""
         hand, mixed = self.scene.hand, self.contents + self.scene.hand
         completes = self.careful & (ingredient_count(mixed) == 3)
-        # Start another soup only while a soup of the current recipe cooks for at least WAIT_LIMIT more steps.
+        # Start another soup only while a soup of the current recipe still needs WAIT_LIMIT steps or more.
         ahead = (mixed != self.recipes[0]) | (self.stock[0] > 0)
         spoils = ahead & ~jnp.any(self.right & (self.timers >= WAIT_LIMIT))
         leaves_it = (self.scene.partner_hand == hand) & (self.memory.calm < WAIT_LIMIT)

@@ -287,14 +287,14 @@ class Conv3x3(nn.Module):
         channels = x.shape[-1] // VISIBLE
         kernel = self.param("kernel", nn.initializers.orthogonal(2**0.5), (3, 3, channels, self.features))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
-        # Taps 0 to 8 are the kernel's; tap 9 is zero, for pairs of cells that are more than one cell apart.
-        taps = jnp.concatenate([kernel.reshape(9, channels, self.features), jnp.zeros_like(kernel[:1, 0])])
-        matrix = taps[_tap_of_cells()].transpose(0, 2, 1, 3).reshape(VISIBLE * channels, VISIBLE * self.features)
-        return x @ matrix + jnp.tile(bias, VISIBLE)
+        # Position 9 is zero, for pairs of cells that are more than one cell apart.
+        weights = jnp.concatenate([kernel.reshape(9, channels, self.features), jnp.zeros_like(kernel[:1, 0])])
+        matrix = weights[_kernel_position_of_cells()].transpose(0, 2, 1, 3)
+        return x @ matrix.reshape(VISIBLE * channels, VISIBLE * self.features) + jnp.tile(bias, VISIBLE)
 
 
-def _tap_of_cells() -> np.ndarray:
-    """Return the kernel tap for each pair of input and output cells, of shape (25, 25); 9 for pairs too far apart."""
+def _kernel_position_of_cells() -> np.ndarray:
+    """Return the position in the kernel for each pair of input and output cells, (25, 25); 9 for distant pairs."""
     cell = np.arange(VISIBLE)
     dy = cell[:, None] // WINDOW - cell // WINDOW + 1
     dx = cell[:, None] % WINDOW - cell % WINDOW + 1

@@ -130,7 +130,7 @@ def test_protocol_swap_keeps_ego_memory_and_random_keys(solo_returns, compiled_p
     first, second = evaluate("mine", ego(PAID), TASKS, rules, programs=compiled_programs)
     stays, wanders = solo_returns
     assert first.returns[0][:2] == [stays[0, 0], wanders[0, 1]]
-    assert second.returns[0] == [40, 40, 0, 0]  # the ego stays, since H4 gave reward in the first episode
+    assert second.returns[0] == [40, 40, 0, 0]  # a reward in the first episode makes the ego stay
     other = dataclasses.replace(H1, teammate=H4.teammate)
     (expected,) = evaluate("fixed", ego(RANDOM), [other], FOUR)
     assert first.returns[0][2:] == expected.returns[0][2:]

@@ -351,7 +351,7 @@ def test_steps_outside_the_context_do_not_affect_outputs(name, context, first_wi
 
 
 def test_full_cached_window_drops_a_fifth_of_its_steps():
-    """With K = 10, a full window drops 2 steps, so its length alternates between 9 and 10 steps."""
+    """With K = 10, a full window drops its 2 oldest steps before a new one, so it has 9 or 10 steps in turn."""
     seen = ego_inputs(16, episode=4)
     cached, ten, nine = (
         compiled_player("ad", context, way)(seen) for context, way in ((10, True), (10, False), (9, False))

@@ -245,7 +245,7 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize(("kind", "change"), [(kind, change) for kind in IMPOSSIBLE for change in IMPOSSIBLE[kind]])
-def test_faults_finds_each_impossible_value(kind, change):
+def test_each_impossible_value_is_found(kind, change):
     record = state_record(CRAMPED, (1, 1, "up"), (3, 2, "up"), **change)
     assert faults(CRAMPED, record) == [kind]
     good = state_record(CRAMPED, (1, 1, "up"), (3, 2, "up"))

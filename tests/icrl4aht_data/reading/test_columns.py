@@ -144,7 +144,7 @@ def test_counts_and_describe_summarize_a_selection(two_sources):
 
 
 class TestWeakLabels:
-    """Test the warning about labels of an expert with low returns; histories are random play with returns near 0."""
+    """Test the warning about labels of an expert with low returns, on histories of random play."""
 
     def test_weak_labels_warning_names_tasks_and_returns(self, expert_release):
         dataset = load_icrl4aht(expert_release, layout="demo_wide")
