@@ -200,7 +200,7 @@ def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -
 
 
 def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int) -> None:
-    """Print the steps/s of a model with `cached` acting on up to `most` tasks, and their ratio to `exact` acting."""
+    """Print how many steps/s a model plays in acting mode `cached`, and the ratio to the speed of mode `exact`."""
     tasks = [task for task in published_tasks(layout_track(layout.name)) if task.layout == layout][:most]
     dropped = dropped_steps(SIZES[size].train["context"])  # steps after which cached acting recomputes its window
     lengths: dict[Acting, int] = {"cached": dropped * -(-10 * steps // dropped), "exact": steps}

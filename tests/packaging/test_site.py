@@ -1,4 +1,4 @@
-"""Test the documentation as a whole: links and names exist, and the site builds without warnings or network."""
+"""Test the documentation as a whole: links and names exist, and the site builds without warnings or network access."""
 
 from __future__ import annotations
 

@@ -177,7 +177,7 @@ def test_the_source_archive_is_complete(sdist):
     assert not {".git", ".venv", "build", "dist", "runs"} & {path.name for path in sdist.iterdir()}
 
 
-def make_environment(version: str, folder: Path, package: str | Path) -> Path:
+def make_virtual_environment(version: str, folder: Path, package: str | Path) -> Path:
     """Create an environment with only a package and its dependencies; return the folder of its commands.
 
     The test is skipped if there is no working Python of the given version.
@@ -194,13 +194,13 @@ def make_environment(version: str, folder: Path, package: str | Path) -> Path:
 @pytest.fixture(scope="module", params=PYTHONS)
 def bare_environment(request, wheel, tmp_path_factory) -> Path:
     """Return the folder of commands of an environment with only the wheel and its dependencies."""
-    return make_environment(request.param, tmp_path_factory.mktemp("bare"), wheel)
+    return make_virtual_environment(request.param, tmp_path_factory.mktemp("bare"), wheel)
 
 
 @pytest.fixture(scope="module", params=PYTHONS)
 def jax_environment(request, wheel, tmp_path_factory) -> Path:
     """Return the folder of commands of an environment with the extra `jax`; tests may add other extras."""
-    return make_environment(request.param, tmp_path_factory.mktemp("jax"), f"{NAME}[jax] @ {wheel.as_uri()}")
+    return make_virtual_environment(request.param, tmp_path_factory.mktemp("jax"), f"{NAME}[jax] @ {wheel.as_uri()}")
 
 
 Run = Callable[..., str]

@@ -178,15 +178,21 @@ class _Network(NamedTuple):
 class _Player:
     """Plays the tasks that share one compiled program; their teammates must have the same functions."""
 
-    def __init__(self, tasks: Sequence[PlayTask], method: Method, play: PlayOptions, mirror: bool) -> None:
-        self.tasks, self._method, self._play, self._mirror = tasks, method, play, mirror
+    def __init__(
+        self,
+        tasks: Sequence[PlayTask],
+        method: Method,
+        play: PlayOptions,
+        mirror: bool,
+        compact: Callable[[Array], Any],
+    ) -> None:
+        self.tasks, self._method, self._play, self._mirror, self._compact = tasks, method, play, mirror, compact
         self._hidden = np.array([task.hidden for task in tasks])
         informed = tasks[0].partner is not None
         self._partners = jnp.array([task.partner for task in tasks], jnp.int32) if informed else None
         # Without changed views, the code for them is left out, which saves time in every step and in compilation.
         self._changes = mirror or bool(self._hidden.any())
         layouts = list(dict.fromkeys(task.layout for task in tasks))
-        self._compact = _observation_filter(method, layouts, self._changes)
         number = {layout: position for position, layout in enumerate(layouts)}
         several = len(layouts) > 1
         self.rollout = EvaluationRollout(
@@ -309,7 +315,10 @@ def make_players(tasks: Sequence[PlayTask], method: Method, play: PlayOptions, m
         shared = (mate.init, mate.act) if mate.sees == "situation" else (task.layout,)
         return (task.family, task.searched, *shared)
 
-    return [_Player(own, method, play, mirror) for own in grouped(tasks, program).values()]
+    # All players have the same filter, because the learner joins their episodes.
+    changes = mirror or any(task.hidden for task in tasks)
+    compact = _observation_filter(method, {task.layout for task in tasks}, changes)
+    return [_Player(own, method, play, mirror, compact) for own in grouped(tasks, program).values()]
 
 
 def _observation_filter(method: Method, layouts: Collection[Layout], changes: bool) -> Callable[[Array], Any]:
@@ -319,9 +328,11 @@ def _observation_filter(method: Method, layouts: Collection[Layout], changes: bo
     `changes` alter the observations, or the view does not have all layouts.
     """
     view = method.model.tokens.encoder.view
-    if changes or view is None or not {*layouts} <= {*view.layouts}:
+    if changes or view is None:
         return lambda obs: obs
-    return view.compact
+    # The entries of a layout do not depend on its recipes.
+    known, played = ({(one.rows, one.indicates_delivery) for one in some} for some in (view.layouts, layouts))
+    return view.compact if played <= known else lambda obs: obs
 
 
 def _model_policy(method: Method, changes: bool, compact: Callable[[Array], Any]) -> Policy:

@@ -355,7 +355,7 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 
 
 def describe_training_runs() -> str:
-    """Return sentences on how the best responses were trained; an empty string without best responses."""
+    """Return sentences on how the best responses were trained, or an empty string if there are none."""
     behaviours = read_best_responses().behaviours
     trained = [training for one in behaviours for training in one.seeds]
     if not trained:

@@ -245,7 +245,7 @@ class EvaluationRun:
 
     @cached_property
     def returns(self) -> dict[ResultCell, CellReturns]:
-        """Result cell -> returns of the agent."""
+        """Returns of the agent in each result cell, that is, on each layout with each family of teammates."""
         return returns_by_cell(self.table)
 
     def has_full_length(self, cell: ResultCell) -> bool:

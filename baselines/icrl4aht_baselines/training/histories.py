@@ -370,8 +370,8 @@ def read_trained(folder: Path) -> TrainedModel:
         ) from error
     if expected != obs_shape:
         raise OptionError(
-            f"{folder}: trained on observations {obs_shape}, but {layouts[0].name} with {channels} channels has "
-            f"{expected} in this version; train again"
+            f"{folder}: trained on observations of shape {obs_shape}, but {layouts[0].name} with {channels} channels "
+            f"has observations of shape {expected} in this version; train again"
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs

@@ -42,7 +42,7 @@ from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, teammate_id
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.overcooked.actions import EGO, STAY
-from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.layouts import get_layout, with_recipes
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import initial_record
 from tests.helpers.commands import run_cli
@@ -186,11 +186,13 @@ def test_previous_actions_of_a_first_step_are_not_mirrored():
 
 def test_entries_are_removed_only_from_unchanged_observations_of_the_encoders_layouts():
     obs = observe(LAYOUT, random_records(LAYOUT, 400, np.random.default_rng(0)), EGO, canonical=True)
-    found = _observation_filter(METHOD, [LAYOUT], False)(obs)
+    found = _observation_filter(METHOD, [LAYOUT, with_recipes(LAYOUT, LAYOUT.recipes[:1])], False)(obs)
     assert 0 < found.values.shape[-1] < obs[0].size / 2
     np.testing.assert_array_equal(METHOD.model.tokens.encoder.view.observations(found), obs)
     for layouts, changes in (([LAYOUT], True), ([LAYOUT, get_layout("demo_wide")], False)):
         assert _observation_filter(METHOD, layouts, changes)(obs) is obs
+    tasks = [PlayTask(LAYOUT, kind, *teammates(1).values(), hidden, "") for kind, hidden in (("a", False), ("b", True))]
+    assert all(player._compact(obs) is obs for player in make_players(tasks, METHOD, PLAY, mirror=False))
 
 
 @pytest.mark.slow

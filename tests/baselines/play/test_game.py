@@ -38,7 +38,7 @@ def test_game_of_two_policies_has_the_returns_of_an_evaluation():
 
 
 def test_egos_can_play_in_the_teammate_slot():
-    """In the teammate's slot, egos receive the observations of that slot, and the oracle can make deliveries."""
+    """An ego that plays as the teammate gets the teammate's observations, and the oracle can deliver there."""
     seen = []
 
     def act(params, memory, view, key):

@@ -1,4 +1,4 @@
-"""Test the environment with JaxMARL's interface: base class, log wrapper, and equality with our environment."""
+"""Test the environment that has JaxMARL's interface: base class, log wrapper, and equality with our environment."""
 
 from __future__ import annotations
 
