@@ -6,6 +6,8 @@ ROOT ?=
 PEER ?=
 OPTIONS ?=
 WORKERS ?= 2
+# One more than the cores, because many slow tests wait for other processes and for downloads.
+SLOW_WORKERS ?= 3
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -52,9 +54,8 @@ test: install ## lint, types and the default tests (5 minutes on 2 cores): WORKE
 test-fast: install
 	$(PYTEST) -m "not slow"
 
-# A third worker on two cores, because many of these tests wait for other processes and downloads.
-test-slow: install ## the slow tests: wheels, killed processes, Ray, several devices, long series of faults
-	$(PYTEST) -n $(shell expr $(WORKERS) + 1) -m slow
+test-slow: install ## the slow tests: wheels, killed processes, Ray, several devices: SLOW_WORKERS=3 (2 GB each)
+	$(PYTEST) -n $(SLOW_WORKERS) -m slow
 
 docs: install ## build the documentation into build/docs; fails on broken links and names
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

@@ -2,7 +2,7 @@
 
 The learner is JaxMARL's script `baselines/IPPO/ippo_rnn_overcooked_v2.py`. JaxMARL's package does not contain the
 script, so it is loaded from a copy. Modules that the script imports only for logging and configuration (hydra,
-omegaconf, wandb) are replaced by stubs. The script also needs distrax, from the extra `peers`.
+omegaconf, wandb) are replaced by stubs while it is loaded. The script also needs distrax, from the extra `peers`.
 """
 
 from __future__ import annotations

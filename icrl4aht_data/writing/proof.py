@@ -27,7 +27,7 @@ _COLUMNS = {
 
 
 def read_proof(root: Path) -> dict[str, Any] | None:
-    """Return the content of `cards/proof.json` if it is about models of the release in `root`; otherwise None."""
+    """Return the content of `cards/proof.json` if its models were trained on the release in `root`; otherwise None."""
     try:
         content = parse_json(read_text(card_file(PROOF_FILE)))
     except OptionError:  # the file has not been made yet

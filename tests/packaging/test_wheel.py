@@ -281,8 +281,9 @@ QUICK_OPTIONS = {
 
 
 def test_the_five_commands_of_the_readme_run_after_its_install_command(jax_environment, wheel, tmp_path):
-    """The environment also has the extra `jax`, which the README's extras include."""
+    """The environment is that of the test before, which installed the extra `baselines`."""
     (extras,) = re.findall(r"^pip install '\.(\[.*?\])'", README, re.MULTILINE)
+    assert extras == "[baselines,hf]"
     install_packages(jax_environment / "python", f"{NAME}{extras} @ {wheel.as_uri()}")
     run = command_runner(jax_environment, tmp_path)
     (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")

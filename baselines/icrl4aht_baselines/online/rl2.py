@@ -325,10 +325,10 @@ def _observation_filter(method: Method, layouts: Collection[Layout], changes: bo
     """Return a function that removes entries of observations that are always 0, which makes the encoder faster.
 
     The function returns observations unchanged if they may have entries that the encoder's view does not have, because
-    `changes` alter the observations, or the view does not have all layouts.
+    `changes` alter the observations, or the view does not have the maps of all layouts.
     """
     view = method.model.tokens.encoder.view
-    if changes or view is None:
+    if changes or view is None or not view.canonical:
         return lambda obs: obs
     # The entries of a layout do not depend on its recipes.
     known, played = ({(one.rows, one.indicates_delivery) for one in some} for some in (view.layouts, layouts))

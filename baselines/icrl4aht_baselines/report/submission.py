@@ -182,8 +182,8 @@ def check_submission(found: Submission, where: str) -> None:
             )
     if not found.update and not any(one.control == "" for one in found.evaluations):
         raise OptionError(
-            f"{where}: found only results of controls or of greedy or sampled actions, but none of the "
-            f"agent's own play; also give the folder with them, or --update if the page already has them"
+            f"{where}: expected results of the agent's own play, found only results of controls or of "
+            f"greedy or sampled actions; also give the folder of the expected results, or --update if the page has them"
         )
 
 

@@ -1,10 +1,9 @@
 """Encoder of observations for learners and sequence models: convolutions, or a dense layer on flat observations.
 
-Inputs are observations, or a compact form that is computed from state records. An encoder has the same parameters for
-both inputs, and equal results up to the order of summation. Convolutions take a `WordWindow`: a 1 x 1 convolution sees
-one cell, so it is computed once per word, which is a possible content of a cell. The dense layer takes `WindowEntries`:
-most entries of an agent's flat window are always 0, because the agent stays in its room. B denotes the batch
-dimensions.
+Inputs are observations, or a compact form of them. An encoder has the same parameters for both, and equal results up to
+the order of summation. Convolutions take a `WordWindow`: a 1 x 1 convolution sees one cell, so it is computed once per
+word, which is a possible content of a cell. The dense layer takes `WindowEntries`: most entries of an agent's flat
+window are always 0, because the agent stays in its room. B denotes the batch dimensions.
 
 Convolutions are matrix products: a 3 x 3 SAME convolution of a 5 x 5 patch is one dense matrix built from its kernel.
 """
@@ -78,7 +77,7 @@ _BLOCKS = 4
 
 @dataclass(frozen=True)
 class CompactView:
-    """Converter of state records to inputs of an encoder: `WordWindow`, `WindowEntries`, or observations for `paper`.
+    """Converter of state records or observations to `WordWindow` or `WindowEntries`, or to observations for kind `paper`.
 
     Attributes:
         kind: kind of the encoder.

@@ -127,7 +127,7 @@ def test_tiny_best_response_and_headroom_jobs_finish(tmp_path, monkeypatch):
     before = (tmp_path / job.name / "result.json").read_bytes()
     job.run(lambda updates, speed: pytest.fail("a finished job was trained again"))
     assert (tmp_path / job.name / "result.json").read_bytes() == before
-    tasks = {"all": [DEMO[1], *tasks_of("teammate", "test_wide", "H1")[:1]]}
+    tasks = {"all": [DEMO[5], *tasks_of("teammate", "test_wide", "H1")[:1]]}
     for other in adaptation_jobs(tasks, 1, TINY, tmp_path):
         other.run()
         assert set(other.result()["returns"]) == {task.task_id for task in tasks["all"]}

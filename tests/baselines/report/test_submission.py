@@ -143,7 +143,7 @@ def test_results_with_sampled_actions_are_added_to_an_agent(tmp_path):
     both = make_submission([drawn, own], FACTS)
     assert (both.agent, [one.control for one in both.evaluations]) == ("mine", ["sampled", ""])
     stored = comparison.add_submission(comparison.StoredResults(), make_submission([own], FACTS))
-    with pytest.raises(OptionError, match="found only results of controls or of greedy or sampled actions, but none"):
+    with pytest.raises(OptionError, match="expected results of the agent's own play, found only results of "):
         make_submission([drawn], FACTS)
     later = comparison.add_submission(stored, make_submission([drawn], AgentFacts("x", "x", "x"), update=True))
     assert len(later.table) == 2 * len(stored.table) and later.agents == {"mine": FACTS}

@@ -113,7 +113,7 @@ def test_ray_workers_collect_bit_equal_tasks(profile, damaged_partial, built, tm
     assert all(ipaddress.ip_address(address.removeprefix("::ffff:")).is_loopback for address in addresses), addresses
     shutil.rmtree(damaged_partial)
     second = next(work for work in load_profile(str(profile)).units() if work.name != own.name)
-    job = CollectionJob(second, load_profile(str(profile)), tmp_path)
+    job = CollectionJob(second, load_profile(str(profile)), damaged_partial.parent)
     assert not job.is_finished() and run_job(job, wait=False) == "done" and job.is_finished()
 
 
