@@ -77,7 +77,7 @@ _BLOCKS = 4
 
 @dataclass(frozen=True)
 class CompactView:
-    """Converter of state records or observations to `WordWindow` or `WindowEntries`, or to observations for kind `paper`.
+    """Converter of state records or observations to the encoder's inputs: for kind `paper` these are observations.
 
     Attributes:
         kind: kind of the encoder.

@@ -10,7 +10,7 @@ import pytest
 
 from icrl4aht_data.overcooked.cells import CENTRE, VISIBLE
 from icrl4aht_data.overcooked.channels import observation_shape
-from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout, with_recipes
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns, record_size
 from icrl4aht_data.overcooked.words import cell_words
@@ -44,6 +44,8 @@ def test_word_entries_include_every_nonzero_entry_of_observations(layout):
     assert np.isin(seen[0], words.entries((0,))).all()
     assert np.isin(seen[1], words.entries((1,))).all()
     np.testing.assert_array_equal(words.entries((0, 1)), np.union1d(words.entries((0,)), words.entries((1,))))
+    one_recipe = cell_words((with_recipes(layout, layout.recipes[:1]),))
+    np.testing.assert_array_equal(one_recipe.entries(), words.entries(), "the entries do not depend on the recipes")
     # model encoders skip the remaining entries of observations, which are always zero
     assert len(words.entries((0,))) < VISIBLE * layout.channels / 2
 
