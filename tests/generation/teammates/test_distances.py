@@ -104,7 +104,7 @@ SHIPPED = get_layout(NAME)
 @pytest.mark.slow
 def test_test_teammate_has_distance_0_to_itself():
     """The distance is 0 also for random actions, since the noise depends on the episode and not on the teammate."""
-    entries = [published_teammates(NAME, family)[4] for family in ("assembly_line", "utility_greedy")]
+    entries = [published_teammates(NAME, "assembly_line")[4], published_teammates(NAME, "utility_greedy")[0]]
     found = nearest_test(SHIPPED, [build_teammate(None, entry) for entry in entries])
     assert [near.distance for near in found] == [0.0] * len(entries)
     assert [near.teammate for near in found] == ["H3/t4", "H4/t0"]
