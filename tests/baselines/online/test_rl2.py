@@ -191,7 +191,8 @@ def test_entries_are_removed_only_from_unchanged_observations_of_the_encoders_la
     np.testing.assert_array_equal(METHOD.model.tokens.encoder.view.observations(found), obs)
     for layouts, changes in (([LAYOUT], True), ([LAYOUT, get_layout("demo_wide")], False)):
         assert _observation_filter(METHOD, layouts, changes)(obs) is obs
-    tasks = [PlayTask(LAYOUT, kind, *teammates(1).values(), hidden, "") for kind, hidden in (("a", False), ("b", True))]
+    (mate,) = teammates(1).values()
+    tasks = [PlayTask(LAYOUT, kind, mate, hidden, "") for kind, hidden in (("a", False), ("b", True))]
     assert all(player._compact(obs) is obs for player in make_players(tasks, METHOD, PLAY, mirror=False))
 
 
