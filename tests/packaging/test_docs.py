@@ -61,7 +61,7 @@ def test_documentation_is_short():
 def run_snippets(page: str, folder: Path) -> dict[str, Any]:
     """Run a page's snippets in order in a folder with a link to the package; return the variables of the snippets.
 
-    The output of a snippet must equal the text block after it, in which "..." stands for the repository's path.
+    What a snippet prints must equal the text block that follows it. "..." in this block means the repository's path.
     Line numbers in tracebacks count the lines of the page.
     """
     names: dict[str, Any] = {}

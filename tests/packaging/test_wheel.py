@@ -275,9 +275,9 @@ QUICK_OPTIONS = {
     "train": "--steps 2 --batch-size 2 --context 20 --width 16 --heads 2",
     "evaluate": "--tasks 1 --episodes 2",
     "generate": "--profile tiny.toml",
-    "release": "build/smoke/lite",
+    "release": "",
 }
-"""Command of the README -> arguments that shorten it, given after the arguments that the README shows."""
+"""Command of the README -> options that shorten it, given after the options that the README shows."""
 
 
 def test_the_five_commands_of_the_readme_run_after_its_install_command(jax_environment, wheel, tmp_path):
