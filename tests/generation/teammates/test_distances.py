@@ -102,6 +102,7 @@ SHIPPED = get_layout(NAME)
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimized_actions")
 def test_test_teammate_has_distance_0_to_itself():
     """The distance is 0 also for random actions, since the noise depends on the episode and not on the teammate."""
     entries = [entry for family in ("assembly_line", "utility_greedy") for entry in published_teammates(NAME, family)]
@@ -111,6 +112,7 @@ def test_test_teammate_has_distance_0_to_itself():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimized_actions")
 def test_measured_draws_equal_the_stored_table():
     """New measurements equal the stored values, except the behaviour's number, which depends on earlier draws."""
     numbers = [("assembly_line", 0, 0), ("assembly_line", 0, 31), ("assembly_line", 1, 5)]

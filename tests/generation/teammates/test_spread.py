@@ -128,6 +128,7 @@ def test_listed_teammates_differ_by_at_least_the_minimum_distance(layout):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimized_actions")
 def test_listed_distances_between_spread_teammates_can_be_measured_again():
     """The test measures two teammates of one family, to compile only this family and the test teammates."""
     layout = get_layout("cramped_up")
