@@ -12,6 +12,7 @@ from jaxmarl.environments.overcooked_v2.overcooked import State as JaxmarlState
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import unpack
+from tests.helpers.xla_flags import optimized
 
 TO_JAXMARL_ACTION = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS])
 
@@ -88,4 +89,4 @@ def jaxmarl_step(env: OvercookedV2):
         both = jnp.stack([obs["agent_0"], obs["agent_1"]])
         return both, state, reward["agent_0"], jnp.stack([shaped["agent_0"], shaped["agent_1"]])
 
-    return jax.jit(jax.vmap(single_step))
+    return optimized(jax.jit(jax.vmap(single_step)))

@@ -1,10 +1,14 @@
-"""XLA flags for tests and their subprocesses."""
+"""XLA flags for tests and their subprocesses, and programs that are compiled with optimizations."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from typing import Any
+
+import jax
 
 
 def add_xla_flag(flag: str) -> str:
@@ -18,3 +22,20 @@ def is_xla_flag(flag: str) -> bool:
     environment = {**os.environ, "XLA_FLAGS": flag, "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", "import jax; jax.devices()"]
     return not subprocess.run(command, env=environment, capture_output=True, check=False).returncode
+
+
+def optimized(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that compiles with optimizations what it calls, for programs that run longer than they compile.
+
+    Other programs of the tests are compiled with few optimizations.
+    """
+
+    def call_optimized(*arguments: Any) -> Any:
+        before = jax.config.read("jax_disable_most_optimizations")
+        jax.config.update("jax_disable_most_optimizations", False)
+        try:
+            return function(*arguments)
+        finally:
+            jax.config.update("jax_disable_most_optimizations", before)
+
+    return call_optimized

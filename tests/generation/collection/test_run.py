@@ -82,7 +82,7 @@ def listening_addresses(process: psutil.Process) -> set[str]:
     found = set()
     for child in [process, *process.children(recursive=True)]:
         try:
-            found |= {c.laddr.ip for c in child.net_connections("inet") if c.status == psutil.CONN_LISTEN}
+            found |= {c.laddr.ip for c in child.net_connections("tcp") if c.status == psutil.CONN_LISTEN}
         except (psutil.NoSuchProcess, psutil.AccessDenied):
             continue
     return found
