@@ -111,7 +111,7 @@ def collection_memory(updates: int) -> dict[str, Any]:
 def measure_peak_memory(updates: int, recording: bool) -> float:
     """Return this process's peak memory in MiB after learning, or after collecting and saving at every update."""
     profile = load_profile("paper")
-    # A small network saves time; the memory depends on the number of environments and the rollout length.
+    # A small network saves time, and memory mainly depends on the number of environments and the rollout length.
     profile = replace(profile, ego=replace(profile.ego, widths=Widths((4,), (4,), 8, 8, 8)))
     if recording:
         collect_updates(profile, updates, save_seconds=0)

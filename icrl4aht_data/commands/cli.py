@@ -107,7 +107,7 @@ class VerbGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def _verbs(self) -> dict[str, Verb]:
-        """Return the `Verb` of each command by its name in this group, in the order of the help text."""
+        """Return a dict from a command's name in this group to its `Verb`, in the order of the help text."""
         found = {
             name.removeprefix(self._prefix): verb
             for name, verb in all_verbs().items()

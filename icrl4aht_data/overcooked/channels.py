@@ -26,7 +26,7 @@ CANONICAL_CHANNELS: tuple[str, ...] = tuple(packed_channels(CANONICAL_TYPES, Tru
 
 
 def channel_names(layout: Layout) -> tuple[str, ...]:
-    """Return the names of a layout's own C channels, in order; the module docstring of `observe` explains them."""
+    """Return the names of the C observation channels of a layout; the module docstring of `observe` explains them."""
     return tuple(packed_channels(layout.ingredient_types, layout.indicates_delivery))
 
 

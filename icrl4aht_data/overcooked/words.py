@@ -53,7 +53,7 @@ class _Slot(NamedTuple):
 
 
 class CellWords:
-    """Vocabulary of observations: a word is a possible content of a visible cell. `cell_words` caches instances.
+    """Vocabulary of observations: a word is a possible state of a visible cell. `cell_words` caches instances.
 
     Attributes:
         layouts: layouts whose observations have the same channels.

@@ -192,7 +192,7 @@ def allocate(stream: BinaryIO, size: int) -> None:
     except (AttributeError, OSError) as error:
         if isinstance(error, OSError) and error.errno not in (errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL):
             raise
-        for start in range(stream.tell(), size, LINE_BYTES):  # some systems cannot allocate disk space
+        for start in range(stream.tell(), size, LINE_BYTES):  # some systems cannot reserve disk space
             stream.write(bytes(min(LINE_BYTES, size - start)))
         stream.flush()
 

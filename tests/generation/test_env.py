@@ -21,7 +21,7 @@ from icrl4aht_data.overcooked.state import State, columns, record_size, unpack
 from tests.helpers.states import random_records, state_record
 
 CRAMPED = LAYOUTS["cramped_up"]
-PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are one piece of ingredient 0 and 1
+PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO is a piece of ingredient 0, ONE is a piece of ingredient 1
 FOUR_RECIPES = np.array([3 * ZERO, 2 * ZERO + ONE, ZERO + 2 * ONE, 3 * ONE], np.uint8)
 
 N, MAX_STEPS, STEPS = 2000, 5, 13  # N environments in one batch

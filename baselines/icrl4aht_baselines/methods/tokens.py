@@ -61,7 +61,7 @@ class Transition(NamedTuple):
 
 
 def plain_view(obs: Array, layouts: Array | None) -> Array:
-    """Return the input unchanged: a `BatchView` for batches of observations."""
+    """Return the observations unchanged; this is the default `BatchView`."""
     return obs
 
 
@@ -107,10 +107,12 @@ class Tokenizer(nn.Module):
 
 
 class StepTokenizer(Tokenizer):
-    """Tokenizer of steps: [Emb(a'); Emb(teammate's a') with +TA; r'; Enc(o)], projected (paper, App. E.2).
+    """Tokenizer of steps: projects the previous actions and reward and the encoded observation (paper, App. E.2).
+
+    The teammate's previous action is an input only of the variants +TA.
 
     Args:
-        partners: number of different values of `StepInput.partner`; 0 if the teammate's number is not an input.
+        partners: number of different values of `StepInput.partner`; 0 if the teammate's index is not an input.
     """
 
     partners: int = 0

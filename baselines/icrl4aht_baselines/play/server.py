@@ -230,7 +230,7 @@ class PlaySession:
                 await connection.send_json(self._setup_message(slot))
                 await self.show()
             else:
-                raise OptionError(f"{text[:80]}: expected an action, a view, or a pseudonym with consent")
+                raise OptionError(f"{text[:80]}: expected a message with an action, a view, or a pseudonym and consent")
         except (ValueError, TypeError, AttributeError, Icrl4ahtError) as error:
             await connection.send_json({"kind": "problem", "text": str(error)})
 

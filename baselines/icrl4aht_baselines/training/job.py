@@ -84,7 +84,7 @@ class TrainingJob(ABC):
         return parse_json(read_text(self.result_file))
 
     def progress(self) -> tuple[int, float] | None:
-        """Return the number of finished training steps, and environment or history steps/s; None without a log."""
+        """Return the finished training steps and the speed in environment or history steps/s; None if unknown."""
         for run, before in self.runs():
             if timing := last_line(run / TIMING):
                 return before + timing["step"], timing["steps_per_second"] * self.steps_per_update
@@ -108,7 +108,7 @@ class TrainingJob(ABC):
         return "finished"
 
     def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
-        """Train the model, measure it, and write result.json."""
+        """Train the model, measure its returns, and write result.json."""
         with run_lock(self.folder, wait=wait):
             if self.is_finished():
                 return

@@ -133,7 +133,7 @@ class HistoryOptions:
     """Choice of the training histories of a run.
 
     Attributes:
-        layouts: names of training layouts, or only `ALL_LAYOUTS`.
+        layouts: names of training layouts; `ALL_LAYOUTS` has to be the only name.
         root: folder or address of a release; None for the bundled mini release.
     """
 

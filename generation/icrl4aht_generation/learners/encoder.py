@@ -160,7 +160,7 @@ def group_equal(seen: Seen) -> Seen:
 
 def _hash_words(ids: Int[Array, "N 25"]) -> tuple[Array, Array]:
     """Return two hashes of each row, uint32 of shape (N,): sums of the word ids times random odd numbers."""
-    # Odd factors are invertible modulo 2**32, so no word's bits are lost.
+    # A product with an odd factor loses no bits, because odd numbers are invertible modulo 2**32.
     factors = np.random.default_rng(0).integers(2**31, size=(2, VISIBLE), dtype=np.uint32) * 2 + 1
     one, two = ((ids.astype(jnp.uint32) * row).sum(axis=-1, dtype=jnp.uint32) for row in factors)
     return one, two

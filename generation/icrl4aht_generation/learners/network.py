@@ -77,7 +77,7 @@ def _scan_states(hidden, gates, reset, recurrent, bias):
 
 
 def _states_gradient(saved, to_states):
-    """Return the gradients for all inputs of `recurrent_states`, up to twice as fast as automatic differentiation.
+    """Return the gradients by all inputs of `recurrent_states`, up to twice as fast as automatic differentiation.
 
     The loop computes only values that depend on the next step. Everything else, such as the weights' gradient, is one
     operation over all steps.

@@ -114,7 +114,7 @@ def test_test_teammate_has_distance_0_to_itself():
 @pytest.mark.slow
 @pytest.mark.usefixtures("optimized_actions")
 def test_measured_draws_equal_the_stored_table():
-    """New measurements equal the stored values, except the behaviour's number, which depends on earlier draws."""
+    """A new measurement gives the stored values, except the index of the behaviour, which depends on earlier draws."""
     numbers = [("assembly_line", 0, 0), ("assembly_line", 0, 31), ("assembly_line", 1, 5)]
     for found, (family, base_seed, theta_id) in zip(measure_draws(SHIPPED, numbers), numbers, strict=True):
         expected = read_draws(SHIPPED.name, family, base_seed)[theta_id]
