@@ -1,4 +1,4 @@
-"""Returns of best responses: the highest known return with a teammate of an ego that sees only its own observations.
+"""Best responses: for each teammate, the highest known return of an ego that sees only its own observations.
 
 The file `cards/best_responses.json` stores the best responses. Each is the return of a recurrent ego trained with one
 teammate, or of another model that earns more. Tasks whose teammates behave the same share a best response.

@@ -1,4 +1,4 @@
-"""XLA flags for tests and their subprocesses, and programs that are compiled with optimizations."""
+"""XLA flags for tests and their subprocesses, and compilation of single functions with optimizations."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def is_xla_flag(flag: str) -> bool:
 
 
 def optimized(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that compiles with optimizations what it calls, for programs that run longer than they compile.
+    """Return a function that does the same and is compiled with optimizations.
 
-    Other programs of the tests are compiled with few optimizations.
+    This saves time if it runs longer than it compiles. The tests compile other functions with few optimizations.
     """
 
     def call_optimized(*arguments: Any) -> Any:

@@ -61,7 +61,7 @@ class Transition(NamedTuple):
 
 
 def plain_view(obs: Array, layouts: Array | None) -> Array:
-    """Return the observations unchanged; this is the default `BatchView`."""
+    """Return the observations unchanged: the `BatchView` of encoders that take plain observations."""
     return obs
 
 

@@ -281,7 +281,7 @@ def block_difference(
 
 
 def common_results(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:
-    """Return the results of two agents that have the same task, seed and training run, in a cell of the table."""
+    """Return the results of two agents in one result cell, for the tasks, seeds and training runs that both have."""
     common: dict[str, Any] = {
         axis: tuple(key for key in getattr(one, axis) if key in getattr(other, axis))
         for axis in ("trainings", "tasks", "seeds")

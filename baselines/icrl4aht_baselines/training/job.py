@@ -108,7 +108,7 @@ class TrainingJob(ABC):
         return "finished"
 
     def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
-        """Train the model, measure its returns, and write result.json."""
+        """Train the model, and write the values that `measure` returns to result.json."""
         with run_lock(self.folder, wait=wait):
             if self.is_finished():
                 return

@@ -133,7 +133,7 @@ class HistoryOptions:
     """Choice of the training histories of a run.
 
     Attributes:
-        layouts: names of training layouts; `ALL_LAYOUTS` has to be the only name.
+        layouts: names of training layouts, or `ALL_LAYOUTS` alone.
         root: folder or address of a release; None for the bundled mini release.
     """
 

@@ -77,10 +77,10 @@ def _scan_states(hidden, gates, reset, recurrent, bias):
 
 
 def _states_gradient(saved, to_states):
-    """Return the gradients by all inputs of `recurrent_states`, up to twice as fast as automatic differentiation.
+    """Return the gradients with respect to all inputs of `recurrent_states`.
 
-    The loop computes only values that depend on the next step. Everything else, such as the weights' gradient, is one
-    operation over all steps.
+    This is up to twice as fast as automatic differentiation. The loop computes only values that depend on the next
+    step. Everything else, such as the weights' gradient, is one operation over all steps.
     """
     (before, r, z, memory, candidate), reset, recurrent = saved
     width = recurrent.shape[0]

@@ -1,7 +1,7 @@
 """Published test instances: the teammates of the 160 published test tasks, on each layout five of each of 4 families.
 
-The bundled manifests contain their parameters and the published task ids, which are hashes of the parameters. The
-families H1 and H2 have other parameters on cramped_down; H3 and H4 have the same parameters on every layout.
+The bundled manifests contain their parameters and the published task ids, which end in a hash of the task and its
+parameters. The families H1 and H2 have other parameters on cramped_down; H3 and H4 have the same on every layout.
 """
 
 from __future__ import annotations

@@ -201,7 +201,7 @@ def _give_way_at_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""]
 
 
 def _should_leave_plates(scene: Scene) -> Bool[Array, ""]:
-    """Return whether to leave plates to the partner: if it holds none, and only one cell gives access to the pile."""
+    """Return whether to leave plates to the partner: it holds none, and the first pile has a single access cell."""
     first = jnp.argmax(scene.plate_piles)
     single = jnp.any(scene.plate_piles) & (scene.single_access_cell(first) >= 0)
     carries = (scene.partner_hand == PLATE) | is_dish(scene.partner_hand)
