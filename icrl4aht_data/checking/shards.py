@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import h5py
@@ -153,6 +154,17 @@ def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: 
         yield f"{differs.sum()} episodes do not start as the environment starts, first episode {differs.argmax()}"
 
 
+class _Datasets(dict[str, Any]):
+    """Datasets of an HDF5 file by path, each opened once, because histories of a task share datasets."""
+
+    def __init__(self, file: h5py.File) -> None:
+        super().__init__()
+        self.file = file
+
+    def __missing__(self, path: str) -> Any:
+        return self.setdefault(path, safe_hdf5.find_node(self.file, path))
+
+
 def check_structure(shard: Shard, values: bool = False) -> list[str]:
     """Return faults in the bytes between chunks, and differences between what libhdf5 and `Shard` read from the file.
 
@@ -177,13 +189,15 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
     try:
         safe_hdf5.check_no_local_heap(shard.path)
         with h5py.File(shard.path, "r") as file:
-            found = list(_structure_faults(shard, file))
-            return faults + (found or list(_value_faults(shard, file) if values else ()))
+            datasets = _Datasets(file)
+            found = list(_structure_faults(shard, datasets))
+            return faults + (found or list(_value_faults(shard, datasets) if values else ()))
     except Exception as error:  # damaged files cause errors of any type in h5py
         return [*faults, f"not an HDF5 file as the index describes it: {error}"]
 
 
-def _structure_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
+def _structure_faults(shard: Shard, datasets: _Datasets) -> Iterator[str]:
+    file = datasets.file
     expected = {"format_version": shard.format_version, "layout": str}
     if (found := safe_hdf5.read_attributes(file)) != expected:
         yield f"attributes: expected {expected}, found {found}"
@@ -197,28 +211,34 @@ def _structure_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
         if stored != names:
             yield f"{group}: expected {sorted(names)}, found {sorted(stored)}"
             return
+
+    @cache
+    def stored_form(path: str) -> tuple[Any, ...]:
+        dataset = datasets[path]
+        return safe_hdf5.filter_ids(dataset), dataset.dtype, dataset.shape, dataset.chunks
+
     faults = 0
     for entry, field in shard.datasets:
-        dataset, rows = safe_hdf5.find_node(file, f"{entry.h5_group}/{field.name}"), entry.rows(field)
+        path, rows = f"{entry.h5_group}/{field.name}", entry.rows(field)
         element, chunk = field.element(shard.layout, shard.kind), min(field.chunk, rows)
         filters = [safe_hdf5.SHUFFLE] * (element.itemsize > 1) + [safe_hdf5.DEFLATE]
         shapes = ((rows,), (chunk,)) if entry.h5_row is None else ((groups[entry.h5_group], rows), (1, chunk))
-        found = safe_hdf5.filter_ids(dataset), dataset.dtype, dataset.shape, dataset.chunks
+        found = stored_form(path)
         if found != (filters, element, *shapes):
             faults += 1
             expected = f"expected filters, type, shape and chunks {(filters, element, *shapes)}"
-            yield f"{dataset.name}: {expected}, found {found}"
+            yield f"{path}: {expected}, found {found}"
     if not faults:
-        chunks = [chunk for entry in entries for chunk in chunk_locations(file, shard.kind, entry)]
+        chunks = [chunk for entry in entries for chunk in chunk_locations(datasets, shard.kind, entry)]
         table = shard.table[["offset", "size", "rows"]][: len(chunks)].tolist()
         wrong = [row for row, (a, b) in enumerate(zip(chunks, table, strict=True)) if a != b]
         if wrong:
             yield f"the chunk table places {shard.describe(wrong[0])} where HDF5 has {chunks[wrong[0]]}"
 
 
-def _value_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
+def _value_faults(shard: Shard, datasets: _Datasets) -> Iterator[str]:
     for entry, field in shard.datasets:
-        dataset: Any = file[f"{entry.h5_group}/{field.name}"]
+        dataset = datasets[f"{entry.h5_group}/{field.name}"]
         try:
             ours = shard.read(entry.history_id, field, 0, entry.rows(field))
         except ShardCorruptError:

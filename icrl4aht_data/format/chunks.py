@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,11 +63,17 @@ def read_table(path: Path) -> np.ndarray:
     return table
 
 
-def chunk_locations(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int, int, int]]:
-    """Return (offset, size, rows) of each chunk of a history, as reported by HDF5, in the order of the chunk table."""
+def chunk_locations(datasets: h5py.File | Mapping[str, Any], kind: Kind, entry: Entry) -> list[tuple[int, int, int]]:
+    """Return (offset, size, rows) of each chunk of a history, as reported by HDF5, in the order of the chunk table.
+
+    Args:
+        datasets: the HDF5 file, or its datasets by path.
+        kind: kind of the release.
+        entry: index entry of the history.
+    """
     locations = []
     for field in entry.stored_fields(kind):
-        dataset: Any = file[f"{entry.h5_group}/{field.name}"]
+        dataset: Any = datasets[f"{entry.h5_group}/{field.name}"]
         for start in range(0, entry.rows(field), field.chunk):
             position = (start,) if entry.h5_row is None else (entry.h5_row, start)
             info = dataset.id.get_chunk_info_by_coord(position)
