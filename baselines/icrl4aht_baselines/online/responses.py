@@ -219,19 +219,22 @@ class ResponseJob(EgoJob):
             policy = with_channels(
                 trained_policy(trainer.method, params, KEPT_STEPS, PlayMode(greedy=greedy)), "canonical"
             )
-            choice, report = (self._mean_return(policy, seeds) for seeds in (CHOICE_SEEDS, REPORT_SEEDS))
-            modes[mode] = {"choice": choice, "return": report}
+            modes[mode] = self._mean_returns(policy)
         lines = map(parse_json, read_text(self.run_folder / METRICS).splitlines())
         returns = [value for line in lines for name, value in line.items() if name.startswith("return ")]
         last, before = returns[len(returns) * 3 // 4 :], returns[len(returns) // 2 : len(returns) * 3 // 4]
         slope = float(np.mean(last) - np.mean(before)) if len(before) else 0.0
         return {"modes": modes, "slope": round(slope, 3)}
 
-    def _mean_return(self, policy: Policy, seeds: Sequence[int]) -> float:
+    def _mean_returns(self, policy: Policy) -> dict[str, float]:
+        """Return the mean returns in episodes with `CHOICE_SEEDS` ("choice") and with `REPORT_SEEDS` ("return")."""
         # The memory is cleared before each episode, as it was in training.
-        played: dict[str, Any] = {"seeds": seeds, "control": "cleared", "played": lambda count: None}
-        results = evaluate("best response", lambda layout: policy, self.tasks, PROTOCOL, **played)
-        return round(float(np.mean([result.returns for result in results])), 3)
+        played: dict[str, Any] = {"control": "cleared", "played": lambda count: None}
+        seeds = (*CHOICE_SEEDS, *REPORT_SEEDS)  # together, because each number of seeds is compiled separately
+        results = evaluate("best response", lambda layout: policy, self.tasks, PROTOCOL, seeds=seeds, **played)
+        returns = np.array([result.returns for result in results])  # shape (tasks, seeds, episodes)
+        choice, report = np.split(returns, [len(CHOICE_SEEDS)], axis=1)
+        return {"choice": round(float(choice.mean()), 3), "return": round(float(report.mean()), 3)}
 
 
 def trained_response(job: ResponseJob) -> TrainingRun:
