@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
+from icrl4aht_data.benchmark.adaptation import ADAPTATION, headroom_text, read_adaptation
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
     HEURISTIC_KINDS,
@@ -223,6 +224,10 @@ def card_facts(root: Path) -> dict[str, Any]:
         "flat_cells": [
             "/".join(cell) for cell in cells_without_headroom(read_reference_returns(HEADROOM_PROTOCOL), tested)
         ],
+        "adaptation": {
+            entry["tasks"].rpartition("-")[2]: headroom_text(entry)
+            for entry in read_adaptation(card_file(ADAPTATION).parent, TRACKS)
+        },
         "arrays": [name for name, array in FIELDS.items() if info.kind not in array.absent and name not in absent],
         **_known_families(tasks),
         "suites": _distinct_values(tasks, "suite"),

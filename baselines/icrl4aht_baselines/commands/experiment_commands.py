@@ -213,7 +213,8 @@ def adaptation_headroom_command(
     seeds. The difference is an estimate, because both egos are trained for --steps only. Writes OUT/adaptation.json.
     Finished training runs are reused, and stopped runs resume.
     """
-    from icrl4aht_baselines.online.adaptation import adaptation_jobs, adaptation_table, write_adaptation
+    from icrl4aht_baselines.online.adaptation import adaptation_jobs, write_adaptation
+    from icrl4aht_data.benchmark.adaptation import adaptation_table
 
     sets: dict[str, list[Task]] = defaultdict(list)
     for task in shared.chosen_tasks(**choice):

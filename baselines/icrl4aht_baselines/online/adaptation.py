@@ -1,9 +1,9 @@
 """Adaptation headroom: how much more an ego earns if it knows the teammate from the start.
 
 Two recurrent egos are trained on the same tasks with the same budget, and both have their memory cleared before each
-episode. The *informed* ego observes the task's number in every step; the *episodic* ego has to find out within the
-episode which teammate it plays with. The informed ego's return minus the episodic ego's return estimates how much
-memory across episodes can raise the return. It is an estimate, because longer training would raise both returns.
+episode. They are the informed and the episodic ego of `icrl4aht_data.benchmark.adaptation`. Their difference estimates
+how much memory across episodes can raise the return. It is an estimate, because longer training would raise both
+returns.
 """
 
 from __future__ import annotations
@@ -21,13 +21,11 @@ from scipy import stats
 from icrl4aht_baselines.online.responses import EgoJob
 from icrl4aht_baselines.online.rl2 import PlayTask
 from icrl4aht_baselines.training.options import ResponseOptions
+from icrl4aht_data.benchmark.adaptation import ADAPTATION, EGO_KINDS, read_adaptation
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import atomic_write, json_hash, write_json
 from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.utils.text import markdown_table
-
-EGO_KINDS = ("informed", "episodic")
 
 MEASURED_EPISODES = 100
 """Number of episodes of each task over which the mean return of a trained ego is measured."""
@@ -109,7 +107,8 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
     """Return the entry of a set of tasks for cards/adaptation.json; None if no seed has finished jobs of both kinds.
 
     An entry has the training steps, the width of the network, the mean return of each kind of ego for each seed,
-    and the mean return on each layout over these seeds.
+    and the mean return on each layout over these seeds. If there are several seeds, "interval" is a 95 % Student's t
+    interval over the seeds of the difference between the two kinds.
     """
     own = [job for job in jobs if job.title == title and job.is_finished()]
     seeds = sorted(set.intersection(*({job.seed for job in own if job.kind == kind} for kind in EGO_KINDS)))
@@ -122,18 +121,21 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
         ids = [task.task_id for task in own[0].tasks if layout in ("", task.layout.name)]
         return round(float(np.mean([[found[kind, seed][task] for task in ids] for seed in seeds])), 3)
 
+    returns = {kind: {str(seed): mean(kind, [seed]) for seed in seeds} for kind in EGO_KINDS}
+    interval = None
+    if len(seeds) > 1:
+        differences = np.subtract(*([*returns[kind].values()] for kind in EGO_KINDS))
+        half = stats.t.ppf(0.975, len(seeds) - 1) * stats.sem(differences)
+        interval = [round(float(differences.mean() + side * half), 3) for side in (-1, 1)]
     return {
         "tasks": title,
         "number": len(own[0].tasks),
         "steps": own[0].options.updates * own[0].options.steps_per_update,
         "width": own[0].options.width,
-        "returns": {kind: {str(seed): mean(kind, [seed]) for seed in seeds} for kind in EGO_KINDS},
+        "returns": returns,
+        "interval": interval,
         "layouts": {layout: {kind: mean(kind, seeds, layout) for kind in EGO_KINDS} for layout in layouts},
     }
-
-
-ADAPTATION = "adaptation.json"
-"""Name of the file of measured returns, in a folder of training runs and among the package's cards."""
 
 
 def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
@@ -150,32 +152,3 @@ def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
     with atomic_write(path) as partial:
         write_json(partial, list(known.values()))
     return path
-
-
-def read_adaptation(folder: Path) -> list[dict[str, Any]]:
-    """Return the entries of a folder's file `ADAPTATION`; an empty list if the file does not exist."""
-    path = folder / ADAPTATION
-    return parse_json(read_text(path)) if path.is_file() else []
-
-
-def adaptation_table(folder: Path, layouts: bool = True) -> str:
-    """Return a Markdown table of measured sets of tasks: the return of each kind of ego, and the difference.
-
-    The difference has a 95 % Student's t interval over the training seeds if there are several. A set of several
-    layouts also gets a row for each layout, unless `layouts` is False.
-    """
-    rows = []
-    for entry in read_adaptation(folder):
-        informed, episodic = (np.array([*entry["returns"][kind].values()]) for kind in EGO_KINDS)
-        differences, seeds = informed - episodic, len(informed)
-        interval = ""
-        if seeds > 1:
-            half = stats.t.ppf(0.975, seeds - 1) * differences.std(ddof=1) / np.sqrt(seeds)
-            interval = f" ({differences.mean() - half:+.1f} to {differences.mean() + half:+.1f})"
-        cells = [f"{informed.mean():.1f}", f"{episodic.mean():.1f}", f"{differences.mean():+.1f}{interval}"]
-        training = [str(seeds), f"{entry['steps']:,}", str(entry["width"])]
-        rows.append([entry["tasks"], str(entry["number"]), *cells, *training])
-        for layout, of in entry["layouts"].items() if layouts and len(entry["layouts"]) > 1 else ():
-            one, other = (of[kind] for kind in EGO_KINDS)
-            rows.append([layout, "", f"{one:.1f}", f"{other:.1f}", f"{one - other:+.1f}", "", "", ""])
-    return markdown_table(["set", "tasks", *EGO_KINDS, "difference", "seeds", "steps of each", "width"], rows, right=7)

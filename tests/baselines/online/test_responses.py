@@ -11,12 +11,14 @@ import pytest
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.protocols import test_tasks as tasks_of
 from icrl4aht_baselines.online import adaptation, responses
-from icrl4aht_baselines.online.adaptation import AdaptationJob, adaptation_jobs, adaptation_table, write_adaptation
+from icrl4aht_baselines.online.adaptation import AdaptationJob, adaptation_jobs, write_adaptation
 from icrl4aht_baselines.online.responses import ResponseJob, ResponseOptions
 from icrl4aht_baselines.training import trainer
 from icrl4aht_generation.teammates.distances import common_records
 
+from icrl4aht_data.benchmark.adaptation import adaptation_table
 from icrl4aht_data.benchmark.best_responses import read_best_responses
+from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.text import card_file
 from tests.helpers.paths import ROOT
@@ -103,7 +105,7 @@ def test_headroom_table_shows_mean_difference_and_interval(tmp_path):
 
 def test_headroom_table_in_the_docs_matches_stored_results():
     page = (ROOT / "docs" / "preference.md").read_text(encoding="utf-8")
-    assert adaptation_table(card_file("adaptation.json").parent, layouts=False) in page
+    assert adaptation_table(card_file("adaptation.json").parent, layouts=False, tracks=[PREFERENCE]) in page
 
 
 def test_headroom_job_with_fewer_tasks_than_needed_raises_error(tmp_path):
