@@ -114,7 +114,9 @@ class CompactView:
         if layout_number is None:
             obs: Any = observe(self.layouts[0], record, EGO, self.canonical)
         else:
-            obs = jnp.asarray(self.words.channels)[self.words.ids(record, layout_number)]
+            # XLA on CPUs would compute a cell's word again for each channel, if this product did not store the words.
+            ids = self.words.ids(record, layout_number) @ np.eye(VISIBLE, dtype=np.int32)
+            obs = jnp.asarray(self.words.channels)[ids]
             obs = obs.reshape(*batch, WINDOW, WINDOW, self.channels)
         return self.compact(obs)
 
