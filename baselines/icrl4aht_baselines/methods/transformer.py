@@ -97,8 +97,9 @@ class TransformerBlock(nn.Module):
 
     def _project(self, x_BxNxD: Array, positions_N: Int[Array, " N"]) -> list[Float[Array, "B N H Dh"]]:
         """Return the queries, keys and values of tokens."""
-        qkv_BxNx3xHxDh = self.qkv(self.attention_norm(x_BxNxD)).reshape(*x_BxNxD.shape[:2], 3, self.heads, -1)
-        q, k, v = (qkv_BxNx3xHxDh[:, :, i] for i in range(3))
+        # The gradient of `split` is a concatenation; that of slices would pad each part with zeros and add them.
+        parts = jnp.split(self.qkv(self.attention_norm(x_BxNxD)), 3, axis=-1)
+        q, k, v = (part.reshape(*x_BxNxD.shape[:2], self.heads, -1) for part in parts)
         return [_rotate(q, positions_N), _rotate(k, positions_N), v] if self.rope else [q, k, v]
 
     def _add_residuals(self, x_BxNxD: Array, attended: Float[Array, "B N H Dh"], deterministic: bool) -> Array:
@@ -114,7 +115,7 @@ def _rotate(x_BxNxHxDh: Float[Array, "B N H Dh"], positions_N: Int[Array, " N"])
     half = x_BxNxHxDh.shape[-1] // 2
     angle_NxF = positions_N[:, None] * 10_000.0 ** (-jnp.arange(half) / half)
     cos, sin = (f(angle_NxF)[:, None, :].astype(x_BxNxHxDh.dtype) for f in (jnp.cos, jnp.sin))
-    one, two = x_BxNxHxDh[..., :half], x_BxNxHxDh[..., half:]
+    one, two = jnp.split(x_BxNxHxDh, 2, axis=-1)
     return jnp.concatenate([one * cos - two * sin, two * cos + one * sin], axis=-1)
 
 
