@@ -188,7 +188,8 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
             faults.append(str(error))
     try:
         safe_hdf5.check_no_local_heap(shard.path)
-        with h5py.File(shard.path, "r") as file:
+        # Without a chunk cache, because each chunk is read once, and every open dataset would have its own cache.
+        with h5py.File(shard.path, "r", rdcc_nbytes=0) as file:
             datasets = _Datasets(file)
             found = list(_structure_faults(shard, datasets))
             return faults + (found or list(_value_faults(shard, datasets) if values else ()))

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
-from icrl4aht_data.benchmark.adaptation import ADAPTATION, headroom_text, read_adaptation
+from icrl4aht_data.benchmark.adaptation import headroom_text, published_adaptation
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
     HEURISTIC_KINDS,
@@ -225,8 +225,7 @@ def card_facts(root: Path) -> dict[str, Any]:
             "/".join(cell) for cell in cells_without_headroom(read_reference_returns(HEADROOM_PROTOCOL), tested)
         ],
         "adaptation": {
-            entry["tasks"].rpartition("-")[2]: headroom_text(entry)
-            for entry in read_adaptation(card_file(ADAPTATION).parent, TRACKS)
+            layout: headroom_text(entry) for layout, entry in published_adaptation().items() if layout in tested
         },
         "arrays": [name for name, array in FIELDS.items() if info.kind not in array.absent and name not in absent],
         **_known_families(tasks),

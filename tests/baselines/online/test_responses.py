@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from icrl4aht_baselines.online.responses import ResponseJob, ResponseOptions
 from icrl4aht_baselines.training import trainer
 from icrl4aht_generation.teammates.distances import common_records
 
-from icrl4aht_data.benchmark.adaptation import adaptation_table
+from icrl4aht_data.benchmark.adaptation import adaptation_table, read_adaptation
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.errors import OptionError
@@ -95,17 +96,30 @@ def test_headroom_table_shows_mean_difference_and_interval(tmp_path):
         assert job.is_finished()
     write_adaptation(jobs, tmp_path)
     row = "| demo_wide | 2 | 10.5 | 5.5 | +5.0 (-7.7 to +17.7) | 2 | 400 | 128 |"
-    assert adaptation_table(tmp_path).splitlines()[-1] == row
+    (entry,) = read_adaptation(tmp_path)
+    assert entry["interval"] == [-7.706, 17.706]
+    assert adaptation_table([entry]).splitlines()[-1] == row
     write_adaptation([job for job in jobs if job.seed == 0], tmp_path)
-    assert "| 2 | 400 |" in adaptation_table(tmp_path), "a measurement with fewer seeds does not replace the stored one"
-    assert (
-        write_adaptation(adaptation_jobs({"other": DEMO[2:3]}, 1, TINY, tmp_path), tmp_path).read_text().count("demo")
-    )
+    assert read_adaptation(tmp_path) == [entry], "a measurement with fewer seeds does not replace the stored one"
+    write_adaptation(adaptation_jobs({"other": DEMO[2:3]}, 1, TINY, tmp_path), tmp_path)
+    assert read_adaptation(tmp_path) == [entry], "no job of the other set is finished"
 
 
 def test_headroom_table_in_the_docs_matches_stored_results():
     page = (ROOT / "docs" / "preference.md").read_text(encoding="utf-8")
-    assert adaptation_table(card_file("adaptation.json").parent, layouts=False, tracks=[PREFERENCE]) in page
+    entries = read_adaptation(card_file("adaptation.json").parent)
+    assert adaptation_table([one for one in entries if one["tasks"].startswith(PREFERENCE)], layouts=False) in page
+
+
+def test_all_episodes_of_a_best_response_are_split_into_choice_and_report(tmp_path, monkeypatch):
+    """The fake returns are the episodes' seeds: the seed of the choice is 1000, the mean of the others is 1."""
+
+    def return_seeds(*arguments, seeds, **options) -> list[SimpleNamespace]:
+        return [SimpleNamespace(returns=[[seed] * 3 for seed in seeds]) for _ in range(2)]
+
+    monkeypatch.setattr(responses, "evaluate", return_seeds)
+    job = ResponseJob((DEMO[0], DEMO[1]), 0, TINY, tmp_path)
+    assert job._mean_returns(None) == {"choice": 1000.0, "return": 1.0}
 
 
 def test_headroom_job_with_fewer_tasks_than_needed_raises_error(tmp_path):
@@ -133,4 +147,6 @@ def test_tiny_best_response_and_headroom_jobs_finish(tmp_path, monkeypatch):
     for other in adaptation_jobs(tasks, 1, TINY, tmp_path):
         other.run()
         assert set(other.result()["returns"]) == {task.task_id for task in tasks["all"]}
-    assert "| all |" in adaptation_table(write_adaptation(adaptation_jobs(tasks, 1, TINY, tmp_path), tmp_path).parent)
+    write_adaptation(adaptation_jobs(tasks, 1, TINY, tmp_path), tmp_path)
+    table = adaptation_table(read_adaptation(tmp_path))
+    assert [line.split(" | ")[0] for line in table.splitlines()[2:]] == ["| all", "| demo_wide", "| test_wide"]

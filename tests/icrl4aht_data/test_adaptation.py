@@ -1,0 +1,63 @@
+"""Test the stored adaptation headroom: which entries count for published layouts, and how they are shown."""
+
+from __future__ import annotations
+
+import pytest
+
+from icrl4aht_data.benchmark import adaptation
+from icrl4aht_data.benchmark.adaptation import adaptation_table, headroom_text, published_adaptation, read_adaptation
+from icrl4aht_data.dataset import MINI
+from icrl4aht_data.utils.files import write_json
+from icrl4aht_data.writing.card import card_facts, render_card
+
+
+def make_entry(tasks: str, informed: float, episodic: float, interval: list[float] | None = None) -> dict:
+    returns = {"informed": {"0": informed}, "episodic": {"0": episodic}}
+    layouts = {"demo_wide": {"informed": informed, "episodic": episodic}}
+    sizes = {"number": 20, "steps": 8_000, "width": 64}
+    return {"tasks": tasks, **sizes, "returns": returns, "interval": interval, "layouts": layouts}
+
+
+ENTRY = make_entry("teammate-test-demo_wide", 10.0, 12.0, [-3.0, -1.0])
+OTHERS = ("teammate-validation-demo_wide", "teammate-test-all", "teammate-test-demo_wide-H1", "preference-test-all")
+
+
+@pytest.fixture
+def measured(tmp_path, monkeypatch) -> None:
+    """Replace the package's measurements by those of `ENTRY`, and of other sets of tasks."""
+    write_json(tmp_path / "adaptation.json", [ENTRY, *(make_entry(name, 1.0, 0.0) for name in OTHERS)])
+    monkeypatch.setattr(adaptation, "card_file", lambda name: tmp_path / name)
+
+
+@pytest.mark.usefixtures("measured")
+def test_only_all_test_tasks_of_a_layout_count_as_measured():
+    assert published_adaptation() == {"demo_wide": ENTRY}
+
+
+@pytest.mark.usefixtures("measured")
+def test_card_states_the_difference_on_each_measured_layout():
+    content = card_facts(MINI)
+    assert content["adaptation"] == {"demo_wide": "-2.0 (-3.0 to -1.0)"}
+    assert "(`cards/adaptation.json`): demo_wide -2.0 (-3.0 to -1.0).\n" in render_card(content)
+    assert "cards/adaptation.json" not in render_card(content | {"adaptation": {}})
+
+
+def test_without_a_file_nothing_is_measured(tmp_path):
+    assert read_adaptation(tmp_path) == []
+
+
+def test_difference_has_an_interval_if_there_are_several_seeds():
+    assert headroom_text(ENTRY) == "-2.0 (-3.0 to -1.0)"
+    assert headroom_text(make_entry("all", 1.0, 1.04)) == "+0.0"
+
+
+def test_table_has_a_row_for_each_layout_of_a_set():
+    both = make_entry("all", 3.0, 1.0)
+    both["layouts"]["test_wide"] = {"informed": 0.0, "episodic": 0.5}
+    row = "| all | 20 | 3.0 | 1.0 | +2.0 | 1 | 8,000 | 64 |"
+    assert adaptation_table([both], layouts=False).splitlines()[2:] == [row]
+    assert adaptation_table([both]).splitlines()[2:] == [
+        row,
+        "| demo_wide |  | 3.0 | 1.0 | +2.0 |  |  |  |",
+        "| test_wide |  | 0.0 | 0.5 | -0.5 |  |  |  |",
+    ]
