@@ -60,3 +60,12 @@ def adaptation_table(entries: Iterable[Mapping[str, Any]], layouts: bool = True)
             one, other = (of[kind] for kind in EGO_KINDS)
             rows.append([layout, "", f"{one:z.1f}", f"{other:z.1f}", f"{one - other:+z.1f}", "", "", ""])
     return markdown_table(["set", "tasks", *EGO_KINDS, "difference", "seeds", "steps of each", "width"], rows, right=7)
+
+
+def published_adaptation_table() -> str:
+    """Return a Markdown table of the published layouts that were measured: returns of both egos, and the difference."""
+    rows = []
+    for layout, entry in published_adaptation().items():
+        means = [f"{fmean(entry['returns'][kind].values()):z.1f}" for kind in EGO_KINDS]
+        rows.append([layout, *means, headroom_text(entry), str(len(entry["returns"]["informed"]))])
+    return markdown_table(["layout", *EGO_KINDS, "difference", "seeds"], rows, right=4)

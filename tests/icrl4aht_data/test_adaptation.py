@@ -5,7 +5,13 @@ from __future__ import annotations
 import pytest
 
 from icrl4aht_data.benchmark import adaptation
-from icrl4aht_data.benchmark.adaptation import adaptation_table, headroom_text, published_adaptation, read_adaptation
+from icrl4aht_data.benchmark.adaptation import (
+    adaptation_table,
+    headroom_text,
+    published_adaptation,
+    published_adaptation_table,
+    read_adaptation,
+)
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.writing.card import card_facts, render_card
@@ -32,6 +38,7 @@ def measured(tmp_path, monkeypatch) -> None:
 @pytest.mark.usefixtures("measured")
 def test_only_all_test_tasks_of_a_layout_count_as_measured():
     assert published_adaptation() == {"demo_wide": ENTRY}
+    assert published_adaptation_table().splitlines()[2:] == ["| demo_wide | 10.0 | 12.0 | -2.0 (-3.0 to -1.0) | 1 |"]
 
 
 @pytest.mark.usefixtures("measured")

@@ -39,7 +39,7 @@ from icrl4aht_baselines.report.scores import (
 from icrl4aht_baselines.report.statistics import MeanInterval, holm_corrected
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission
 from icrl4aht_baselines.training.seen import overlap_legend, overlap_marks
-from icrl4aht_data.benchmark.adaptation import adaptation_table, published_adaptation
+from icrl4aht_data.benchmark.adaptation import published_adaptation_table
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, read_reference_returns
@@ -209,7 +209,7 @@ def render_comparison(stored: StoredResults) -> str:
         difference=describe_lead(results, scales),
         controls=controls_table(stored, results, scales),
         layouts=layouts_table(results, scales),
-        adaptation=adaptation_table(published_adaptation().values()),
+        adaptation=published_adaptation_table(),
         trainings=describe_training_runs(),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
         earlier=", ".join(f"`{agent}`" for agent in every if agent not in results) or "none",
