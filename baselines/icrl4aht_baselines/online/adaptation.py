@@ -124,7 +124,8 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
     returns = {kind: {str(seed): mean(kind, [seed]) for seed in seeds} for kind in EGO_KINDS}
     interval = None
     if len(seeds) > 1:
-        differences = np.subtract(*([*returns[kind].values()] for kind in EGO_KINDS))
+        informed, episodic = (np.array([*returns[kind].values()]) for kind in EGO_KINDS)
+        differences = informed - episodic
         half = stats.t.ppf(0.975, len(seeds) - 1) * stats.sem(differences)
         interval = [round(float(differences.mean() + side * half), 3) for side in (-1, 1)]
     return {
