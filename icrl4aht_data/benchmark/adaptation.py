@@ -17,6 +17,8 @@ from icrl4aht_data.utils.text import card_file, markdown_table
 
 EGO_KINDS = ("informed", "episodic")
 
+_LAYOUT_TASKS = 20  # number of test tasks on each published layout
+
 ADAPTATION = "adaptation.json"
 """Name of the file of measured returns, in a folder of training runs and among the package's cards."""
 
@@ -31,7 +33,8 @@ def published_adaptation() -> dict[str, dict[str, Any]]:
     """Return layout -> entry of all test tasks on this layout, for the published layouts that were measured."""
     entries = {entry["tasks"]: entry for entry in read_adaptation(card_file(ADAPTATION).parent)}
     titles = {layout: f"{track}-test-{layout}" for track, splits in TRACKS.items() for layout in splits["test"]}
-    return {layout: entries[title] for layout, title in titles.items() if title in entries}
+    found = {layout: entries[title] for layout, title in titles.items() if title in entries}
+    return {layout: entry for layout, entry in found.items() if entry["number"] == _LAYOUT_TASKS}
 
 
 def headroom_text(entry: Mapping[str, Any]) -> str:
@@ -67,5 +70,6 @@ def published_adaptation_table() -> str:
     rows = []
     for layout, entry in published_adaptation().items():
         means = [f"{fmean(entry['returns'][kind].values()):z.1f}" for kind in EGO_KINDS]
-        rows.append([layout, *means, headroom_text(entry), str(len(entry["returns"]["informed"]))])
-    return markdown_table(["layout", *EGO_KINDS, "difference", "seeds"], rows, right=4)
+        steps = f"{len(entry['returns']['informed'])} x {entry['steps']:,}"
+        rows.append([layout, *means, headroom_text(entry), steps])
+    return markdown_table(["layout", *EGO_KINDS, "difference", "seeds x steps"], rows, right=4)

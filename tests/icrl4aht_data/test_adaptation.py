@@ -31,22 +31,25 @@ OTHERS = ("teammate-validation-demo_wide", "teammate-test-all", "teammate-test-d
 @pytest.fixture
 def measured(tmp_path, monkeypatch) -> None:
     """Replace the package's measurements by those of `ENTRY`, and of other sets of tasks."""
-    write_json(tmp_path / "adaptation.json", [ENTRY, *(make_entry(name, 1.0, 0.0) for name in OTHERS)])
+    few = make_entry("teammate-test-demo_simple", 1.0, 0.0) | {"number": 19}
+    write_json(tmp_path / "adaptation.json", [ENTRY, few, *(make_entry(name, 1.0, 0.0) for name in OTHERS)])
     monkeypatch.setattr(adaptation, "card_file", lambda name: tmp_path / name)
 
 
 @pytest.mark.usefixtures("measured")
 def test_only_all_test_tasks_of_a_layout_count_as_measured():
     assert published_adaptation() == {"demo_wide": ENTRY}
-    assert published_adaptation_table().splitlines()[2:] == ["| demo_wide | 10.0 | 12.0 | -2.0 (-3.0 to -1.0) | 1 |"]
+    assert published_adaptation_table().splitlines()[2:] == [
+        "| demo_wide | 10.0 | 12.0 | -2.0 (-3.0 to -1.0) | 1 x 8,000 |"
+    ]
 
 
 @pytest.mark.usefixtures("measured")
 def test_card_states_the_difference_on_each_measured_layout():
     content = card_facts(MINI)
     assert content["adaptation"] == {"demo_wide": "-2.0 (-3.0 to -1.0)"}
-    assert "(`cards/adaptation.json`): demo_wide -2.0 (-3.0 to -1.0).\n" in render_card(content)
-    assert "cards/adaptation.json" not in render_card(content | {"adaptation": {}})
+    assert "if no interval follows): demo_wide -2.0 (-3.0 to -1.0).\n" in render_card(content)
+    assert "if no interval follows" not in render_card(content | {"adaptation": {}})
 
 
 def test_without_a_file_nothing_is_measured(tmp_path):
