@@ -64,7 +64,7 @@ class Sizes:
     """Sizes and durations of all measurements, by default those for a GPU.
 
     Attributes:
-        product: number of rows and columns of the matrices whose multiplication is timed.
+        product: side length of the square matrices in the benchmark of matrix multiplication.
         ppo: hyper-parameters of the learner, except the encoder of its network.
         batch: B, batch size in training.
         length: upper limit of L in training and of K in acting.

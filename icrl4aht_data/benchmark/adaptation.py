@@ -29,12 +29,22 @@ def read_adaptation(folder: Path) -> list[dict[str, Any]]:
     return parse_json(read_text(path)) if path.is_file() else []
 
 
+def task_set_name(track: str, split: str, layout: str, families: Iterable[str] = ()) -> str:
+    """Return the name of a set of tasks in entries; `layout` is "all" if one ego plays all layouts."""
+    return "-".join((track, split, layout, *families))
+
+
 def published_adaptation() -> dict[str, dict[str, Any]]:
     """Return layout -> entry of all test tasks on this layout, for the published layouts that were measured."""
     entries = {entry["tasks"]: entry for entry in read_adaptation(card_file(ADAPTATION).parent)}
-    titles = {layout: f"{track}-test-{layout}" for track, splits in TRACKS.items() for layout in splits["test"]}
-    found = {layout: entries[title] for layout, title in titles.items() if title in entries}
+    names = {layout: task_set_name(track, "test", layout) for track, of in TRACKS.items() for layout in of["test"]}
+    found = {layout: entries[name] for layout, name in names.items() if name in entries}
     return {layout: entry for layout, entry in found.items() if entry["number"] == _LAYOUT_TASKS}
+
+
+def _mean_returns(entry: Mapping[str, Any]) -> list[float]:
+    """Return the mean return over the training seeds of each of `EGO_KINDS`."""
+    return [fmean(entry["returns"][kind].values()) for kind in EGO_KINDS]
 
 
 def headroom_text(entry: Mapping[str, Any]) -> str:
@@ -42,7 +52,7 @@ def headroom_text(entry: Mapping[str, Any]) -> str:
 
     The interval is a 95 % Student's t interval over the training seeds; there is none for a single seed.
     """
-    informed, episodic = (fmean(entry["returns"][kind].values()) for kind in EGO_KINDS)
+    informed, episodic = _mean_returns(entry)
     interval = " ({:+z.1f} to {:+z.1f})".format(*entry["interval"]) if entry.get("interval") else ""
     return f"{informed - episodic:+z.1f}{interval}"
 
@@ -56,7 +66,7 @@ def adaptation_table(entries: Iterable[Mapping[str, Any]], layouts: bool = True)
     """
     rows = []
     for entry in entries:
-        means = [f"{fmean(entry['returns'][kind].values()):z.1f}" for kind in EGO_KINDS]
+        means = [f"{mean:z.1f}" for mean in _mean_returns(entry)]
         training = [str(len(entry["returns"]["informed"])), f"{entry['steps']:,}", str(entry["width"])]
         rows.append([entry["tasks"], str(entry["number"]), *means, headroom_text(entry), *training])
         for layout, of in entry["layouts"].items() if layouts and len(entry["layouts"]) > 1 else ():
@@ -69,7 +79,7 @@ def published_adaptation_table() -> str:
     """Return a Markdown table of the published layouts that were measured: returns of both egos, and the difference."""
     rows = []
     for layout, entry in published_adaptation().items():
-        means = [f"{fmean(entry['returns'][kind].values()):z.1f}" for kind in EGO_KINDS]
+        means = [f"{mean:z.1f}" for mean in _mean_returns(entry)]
         steps = f"{len(entry['returns']['informed'])} x {entry['steps']:,}"
         rows.append([layout, *means, headroom_text(entry), steps])
     return markdown_table(["layout", *EGO_KINDS, "difference", "seeds x steps"], rows, right=4)

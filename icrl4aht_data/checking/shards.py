@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator
-from functools import cache
+from collections.abc import Callable, Iterator
+from functools import cache, partial
 from typing import Any
 
 import h5py
@@ -154,17 +154,6 @@ def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: 
         yield f"{differs.sum()} episodes do not start as the environment starts, first episode {differs.argmax()}"
 
 
-class _Datasets(dict[str, Any]):
-    """Datasets of an HDF5 file by path, each opened once, because histories of a task share datasets."""
-
-    def __init__(self, file: h5py.File) -> None:
-        super().__init__()
-        self.file = file
-
-    def __missing__(self, path: str) -> Any:
-        return self.setdefault(path, safe_hdf5.find_node(self.file, path))
-
-
 def check_structure(shard: Shard, values: bool = False) -> list[str]:
     """Return faults in the bytes between chunks, and differences between what libhdf5 and `Shard` read from the file.
 
@@ -190,15 +179,14 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
         safe_hdf5.check_no_local_heap(shard.path)
         # Without a chunk cache, because each chunk is read once, and every open dataset would have its own cache.
         with h5py.File(shard.path, "r", rdcc_nbytes=0) as file:
-            datasets = _Datasets(file)
-            found = list(_structure_faults(shard, datasets))
-            return faults + (found or list(_value_faults(shard, datasets) if values else ()))
+            open_dataset = cache(partial(safe_hdf5.find_node, file))  # histories of a task share datasets
+            found = list(_structure_faults(shard, file, open_dataset))
+            return faults + (found or list(_value_faults(shard, open_dataset) if values else ()))
     except Exception as error:  # damaged files cause errors of any type in h5py
         return [*faults, f"not an HDF5 file as the index describes it: {error}"]
 
 
-def _structure_faults(shard: Shard, datasets: _Datasets) -> Iterator[str]:
-    file = datasets.file
+def _structure_faults(shard: Shard, file: h5py.File, open_dataset: Callable[[str], Any]) -> Iterator[str]:
     expected = {"format_version": shard.format_version, "layout": str}
     if (found := safe_hdf5.read_attributes(file)) != expected:
         yield f"attributes: expected {expected}, found {found}"
@@ -215,7 +203,7 @@ def _structure_faults(shard: Shard, datasets: _Datasets) -> Iterator[str]:
 
     @cache
     def stored_form(path: str) -> tuple[Any, ...]:
-        dataset = datasets[path]
+        dataset = open_dataset(path)
         return safe_hdf5.filter_ids(dataset), dataset.dtype, dataset.shape, dataset.chunks
 
     faults = 0
@@ -230,16 +218,16 @@ def _structure_faults(shard: Shard, datasets: _Datasets) -> Iterator[str]:
             expected = f"expected filters, type, shape and chunks {(filters, element, *shapes)}"
             yield f"{path}: {expected}, found {found}"
     if not faults:
-        chunks = [chunk for entry in entries for chunk in chunk_locations(datasets, shard.kind, entry)]
+        chunks = [chunk for entry in entries for chunk in chunk_locations(open_dataset, shard.kind, entry)]
         table = shard.table[["offset", "size", "rows"]][: len(chunks)].tolist()
         wrong = [row for row, (a, b) in enumerate(zip(chunks, table, strict=True)) if a != b]
         if wrong:
             yield f"the chunk table places {shard.describe(wrong[0])} where HDF5 has {chunks[wrong[0]]}"
 
 
-def _value_faults(shard: Shard, datasets: _Datasets) -> Iterator[str]:
+def _value_faults(shard: Shard, open_dataset: Callable[[str], Any]) -> Iterator[str]:
     for entry, field in shard.datasets:
-        dataset = datasets[f"{entry.h5_group}/{field.name}"]
+        dataset = open_dataset(f"{entry.h5_group}/{field.name}")
         try:
             ours = shard.read(entry.history_id, field, 0, entry.rows(field))
         except ShardCorruptError:

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from icrl4aht_data.errors import ChunkTableError
 from icrl4aht_data.format.schema import CHUNK_DTYPE, Entry, Kind
-
-if TYPE_CHECKING:
-    import h5py  # only for type hints: the import takes 50 ms, and reading does not need h5py
 
 METADATA_ROW_BYTES = 2048
 """Maximum bytes of HDF5 metadata per row of the chunk table; a damaged row is fetched again as one piece."""
@@ -63,17 +60,17 @@ def read_table(path: Path) -> np.ndarray:
     return table
 
 
-def chunk_locations(datasets: h5py.File | Mapping[str, Any], kind: Kind, entry: Entry) -> list[tuple[int, int, int]]:
+def chunk_locations(open_dataset: Callable[[str], Any], kind: Kind, entry: Entry) -> list[tuple[int, int, int]]:
     """Return (offset, size, rows) of each chunk of a history, as reported by HDF5, in the order of the chunk table.
 
     Args:
-        datasets: the HDF5 file, or its datasets by path.
+        open_dataset: function from the path of a dataset in the shard to the HDF5 dataset.
         kind: kind of the release.
         entry: index entry of the history.
     """
     locations = []
     for field in entry.stored_fields(kind):
-        dataset: Any = datasets[f"{entry.h5_group}/{field.name}"]
+        dataset = open_dataset(f"{entry.h5_group}/{field.name}")
         for start in range(0, entry.rows(field), field.chunk):
             position = (start,) if entry.h5_row is None else (entry.h5_row, start)
             info = dataset.id.get_chunk_info_by_coord(position)

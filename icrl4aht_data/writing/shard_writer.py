@@ -71,7 +71,7 @@ def write_shard(
             for field, start, data in sorted(chunks, key=lambda chunk: chunk_sort_key(chunk.field, chunk.start)):
                 position = (start,) if entry.h5_row is None else (entry.h5_row, start)
                 open_dataset(f"{entry.h5_group}/{field.name}").id.write_direct_chunk(position, data)
-        locations = [row for entry in entries for row in chunk_locations(file, kind, entry)]
+        locations = [row for entry in entries for row in chunk_locations(open_dataset, kind, entry)]
         stored = [chunk.data for chunks in histories for chunk in chunks]
         rows = [(*row, *_checksums(data)) for row, data in zip(locations, stored, strict=True)]
         table = np.array(rows, CHUNK_DTYPE)

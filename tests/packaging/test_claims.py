@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Callable
 from functools import cache
+from statistics import fmean
 from typing import Literal
 
 import pytest
@@ -17,6 +18,8 @@ from icrl4aht_baselines import reference
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.methods.ad import dropped_steps
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
+from icrl4aht_baselines.report.comparison import mean_best_return
+from icrl4aht_baselines.report.scores import cell_scales
 from icrl4aht_baselines.training.options import SAVE_MINUTES, HistoryOptions
 from icrl4aht_generation.layouts.families import LAYOUT_SPLITS
 from icrl4aht_generation.layouts.rooms import MOST_COLUMNS, MOST_ROWS
@@ -26,6 +29,7 @@ from icrl4aht_generation.teammates.draws import DRAWS_PER_SEED
 from icrl4aht_generation.teammates.heuristics.territory import TERRITORY
 from icrl4aht_generation.teammates.instances import INSTANCES
 
+from icrl4aht_data.benchmark.adaptation import EGO_KINDS, headroom_text, published_adaptation, read_adaptation
 from icrl4aht_data.benchmark.facts import (
     KEPT_STEPS,
     LABEL_EPISODES,
@@ -124,11 +128,40 @@ def bundled_release_size() -> tuple[int, ...]:
     return len(entries), len(tasks), len(layouts), sum(entry.T for entry in entries), round(size / 1e6)
 
 
+def adaptation_on_demo_wide() -> tuple[float, ...]:
+    """Return the returns of the informed and the episodic ego on demo_wide."""
+    returns = published_adaptation()["demo_wide"]["returns"]
+    return tuple(fmean(returns[kind].values()) for kind in EGO_KINDS)
+
+
+def adaptation_headroom() -> tuple[float, ...]:
+    """Return the least and the greatest headroom of published layouts, their number, and that of `preference`."""
+    found, (preference,) = published_adaptation().values(), read_adaptation(ROOT / "cards")[:1]
+    assert preference["tasks"] == "preference-test-all"
+    differences = [float(headroom_text(entry).split()[0]) for entry in (*found, preference)]
+    return min(differences[:-1]), max(differences[:-1]), len(found), differences[-1]
+
+
+def gain_of_best_responses() -> float:
+    """Return the mean best response on asymm_right minus the informed ego's return."""
+    informed = published_adaptation()["asymm_right"]["returns"]["informed"]
+    best = mean_best_return("asymm_right", cell_scales("seeded"))
+    assert best is not None
+    return best - fmean(informed.values())
+
+
 CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("README", "{} of the {} bundled histories rises by at least {}", count_rising_returns),
     ("README", "{} histories of {} tasks on {} layouts: {} steps in {} MB", bundled_release_size),
     ("README", "delivery is worth {}", lambda: DELIVERY_REWARD),
     ("README", "in {} of the {} cells", count_cells_without_headroom),
+    (
+        "README",
+        "identity earned {}, and an ego that forgets everything .. episode {},",
+        adaptation_on_demo_wide,
+    ),
+    ("docs/protocol", "difference: {} to +{} on [{} published .. and +{} on the [track", adaptation_headroom),
+    ("docs/protocol", "best responses earn {} more than the informed ego", gain_of_best_responses),
     ("docs/index", "{} test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/evaluating", "{} published test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/protocol", "plays {} episodes of {} steps", lambda: (SEEDED.episodes, SEEDED.steps)),

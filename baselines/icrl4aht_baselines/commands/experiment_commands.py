@@ -214,12 +214,12 @@ def adaptation_headroom_command(
     Finished training runs are reused, and stopped runs resume.
     """
     from icrl4aht_baselines.online.adaptation import adaptation_jobs, write_adaptation
-    from icrl4aht_data.benchmark.adaptation import adaptation_table, read_adaptation
+    from icrl4aht_data.benchmark.adaptation import adaptation_table, read_adaptation, task_set_name
 
     sets: dict[str, list[Task]] = defaultdict(list)
     for task in shared.chosen_tasks(**choice):
         where = "all" if together else task.layout.name
-        sets["-".join((task.track, task.split, where, *choice["families"]))].append(task)
+        sets[task_set_name(task.track, task.split, where, choice["families"])].append(task)
     jobs = adaptation_jobs(sets, seeds, replace_options(ResponseOptions(_STEPS), training), out)
     return jobs, partial(write_adaptation, jobs), lambda folder: adaptation_table(read_adaptation(folder))
 

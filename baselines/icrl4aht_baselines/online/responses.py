@@ -229,9 +229,15 @@ class ResponseJob(EgoJob):
     def _mean_returns(self, policy: Policy) -> dict[str, float]:
         """Return the mean returns in episodes with `CHOICE_SEEDS` ("choice") and with `REPORT_SEEDS` ("return")."""
         # The memory is cleared before each episode, as it was in training.
-        played: dict[str, Any] = {"control": "cleared", "played": lambda count: None}
-        seeds = (*CHOICE_SEEDS, *REPORT_SEEDS)  # together, because each number of seeds is compiled separately
-        results = evaluate("best response", lambda layout: policy, self.tasks, PROTOCOL, seeds=seeds, **played)
+        results = evaluate(
+            "best response",
+            lambda layout: policy,
+            self.tasks,
+            PROTOCOL,
+            seeds=(*CHOICE_SEEDS, *REPORT_SEEDS),  # together, because each number of seeds is compiled separately
+            control="cleared",
+            played=lambda count: None,
+        )
         returns = np.array([result.returns for result in results])  # shape (tasks, seeds, episodes)
         choice, report = np.split(returns, [len(CHOICE_SEEDS)], axis=1)
         return {"choice": round(float(choice.mean()), 3), "return": round(float(report.mean()), 3)}
