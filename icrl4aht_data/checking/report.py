@@ -17,7 +17,7 @@ NamedProgress = Callable[[str, int, int], None]
 
 _FINDINGS = 100_000  # maximum number of findings in a report
 _SHOWN = 5  # number of findings in the `repr` of a report
-_LONG = 2000  # maximum characters of a finding
+_LONG = 2000  # maximum number of characters of a finding
 
 
 @dataclass(frozen=True)

@@ -159,7 +159,8 @@ class CellWords:
                 agents can have more such entries than one agent.
 
         Returns:
-            Entries int64 (E,), ascending: cell * C + channel, with cells of the window in reading order.
+            Entries int32 (E,), ascending: cell * C + channel, with cells of the window in reading order. JAX uses
+            int32 as it is, with and without 64-bit types.
         """
         nonzero = self.channels[:-1] > 0
         shown = np.zeros((VISIBLE, nonzero.shape[-1]), bool)
@@ -172,7 +173,7 @@ class CellWords:
                 relative = np.unique(layout.window_position[np.ix_(room, other_room)])
                 shown[np.setdiff1d(relative, [NOWHERE, CENTRE])] |= of_kind[_OTHER]
                 shown[CENTRE] |= of_kind[_SELF]
-        return np.flatnonzero(shown)
+        return np.flatnonzero(shown).astype(np.int32)
 
 
 @lru_cache(maxsize=16)

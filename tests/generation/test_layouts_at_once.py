@@ -30,7 +30,7 @@ def recorded_steps() -> dict[str, np.ndarray]:
 
     def step(state, key):
         actions = jax.random.randint(key, (ENVS, 2), 0, 6)
-        actions = jnp.where(jax.random.uniform(key, actions.shape) < 0.4, 5, actions)  # about half are `interact`
+        actions = jnp.where(jax.random.uniform(key, actions.shape) < 0.4, 5, actions)  # about half of them interact
         after = env.step(state, actions)
         shown = {
             "record": state.record,

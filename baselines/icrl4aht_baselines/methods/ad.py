@@ -35,7 +35,7 @@ class StepOutput(NamedTuple):
 
     Attributes:
         head: output of the model's head, float (B, L, ..).
-        next_obs: float (B, L, N), predicted observation after the action; None without +next_obs.
+        next_obs: float (B, L, N), predicted observation after the action; None if the model does not predict it.
     """
 
     head: Any

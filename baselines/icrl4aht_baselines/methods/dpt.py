@@ -41,7 +41,7 @@ class DPTOutput(NamedTuple):
 
     Attributes:
         logits: float (B, K + 1, A), logits of the policy after the first j transitions, j = 0..K.
-        next_obs: float (B, K - 1, N), predicted next observations of transitions 2..K; None without +next_obs.
+        next_obs: float (B, K - 1, N), predicted next observations of transitions 2..K; None if not predicted.
     """
 
     logits: Float[Array, "B K+1 A"]

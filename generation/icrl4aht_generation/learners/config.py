@@ -101,7 +101,7 @@ class PPOConfig:
 
     @property
     def steps_per_update(self) -> int:
-        """Number of environment steps of an update, over all environments."""
+        """Number of environment steps per update, summed over all environments."""
         return self.environments * self.rollout
 
     @property

@@ -103,7 +103,7 @@ class CompactView:
 
     @property
     def entries(self) -> np.ndarray:
-        """Indices of the E entries of a flat observation that are not always 0, int64; see `WindowEntries`."""
+        """Indices of the E entries of a flat observation that are not always 0, int32; see `WindowEntries`."""
         return self.words.entries(self.agents)
 
     def __call__(self, record: UInt8[Array, "*B S"], layout_number: Array | None = None) -> Seen:

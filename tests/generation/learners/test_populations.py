@@ -132,7 +132,7 @@ def paper_slot_weights(algorithm: Any, memory: Any) -> np.ndarray:
         elif isinstance(algorithm, CoMeDi):
             quarter = env // 4
             alpha, beta = algorithm.cross_play_weight, algorithm.mixed_play_weight
-            # The objective J_MP has half the mean over 4 self-play slots, and half the mean over 2 other slots.
+            # J_MP is half the mean over the 4 self-play slots plus half that over the 2 with the frozen member.
             mixed = beta / 2 / 4 if left == right else beta / 2 / 2
             both = {0: 1 / 8, 1: -alpha / 4, 2: 0, 3: mixed}[quarter]
             expected[:, env] = [both * (left == 0), both * (right == 0)]

@@ -1,4 +1,4 @@
-"""Test that a file lock has one holder at a time although the lock file is removed after use."""
+"""Test that a file lock has only one holder at a time, even though the lock file is removed after use."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def _rule_action(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, "
 
 def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
     """Return the step towards a target, around the partner; agent 1 waits if the partner is at the only access cell."""
-    # Thresholds are float32 like the parameters, so a parameter of 0.1 or 0.3 reaches the threshold.
+    # Thresholds are float32 like the parameters, so a parameter of 0.1 or 0.3 equals its threshold despite rounding.
     step, cost = scene.approach(target)
     goes_around = scene.destination(step) == scene.partner_cell
     if scene.slot == 0:
