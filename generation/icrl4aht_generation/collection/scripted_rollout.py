@@ -40,6 +40,9 @@ differently."""
 _NOISE = 2
 """Number folded into an episode's key to draw random actions; see `Environment.episode_key`."""
 
+_NOT_RANDOM = -1
+"""Marks steps in which the script's action is taken."""
+
 
 def noise_schedules(config: NoiseConfig, seed: int) -> np.ndarray:
     """Return the chance of a random action in every episode, float32 of shape (N, E); see `NoiseConfig`.
@@ -157,7 +160,7 @@ def _compiled_play(teammate: Policy, searches: bool) -> Callable[..., tuple[dict
     def play(tables: Tables, expert: Any, params: Any, key: Key[Array, ""], history, episode, chance, memory):
         env, m = Environment(tables), len(history)
         keys = _episode_keys(key, history, episode)
-        players = [_noisy_script(env, script, expert, chance), policy_player(env, teammate, params, TEAMMATE, m)]
+        players = [_noisy_script(env, script, expert, keys, chance), policy_player(env, teammate, params, TEAMMATE, m)]
         start = init_rollout(env, players, keys)
         if searches:
             own = select_rows(episode == 0, start.memories[EGO], memory)
@@ -188,19 +191,29 @@ def _blank_memories(params: Any, count: int) -> Any:
     return jax.tree.map(lambda leaf: np.zeros((count, *leaf.shape), leaf.dtype), shape)
 
 
-def _noisy_script(env: Environment, script: Policy, params: Any, chance: Float[Array, " M"]) -> Player:
+def _noisy_script(
+    env: Environment, script: Policy, params: Any, keys: Key[Array, " M"], chance: Float[Array, " M"]
+) -> Player:
     """Return a player of agent 0 in M environments that follows a script, or acts at random with a given chance.
 
     The script remembers the action that was taken, so the recorded states and actions determine the script's action in
     every state.
     """
-    player = policy_player(env, script, params, EGO, chance.shape[0])
+    player = policy_player(env, script, params, EGO, len(chance))
     fold = jax.vmap(jax.random.fold_in)
+    own = fold(env.episode_key(env.init(keys)), jnp.full(len(chance), _NOISE))
+
+    def draw(step: Int[Array, ""]) -> Int[Array, " M"]:
+        keys = fold(own, jnp.broadcast_to(step, len(chance)))
+        return jax.vmap(randomize_action)(keys, chance, jnp.full(len(chance), _NOT_RANDOM))
+
+    # On CPUs, one draw for all steps is many times as fast as one draw in each step.
+    drawn = jax.vmap(draw)(jnp.arange(KEPT_STEPS))
 
     def act(memory: Any, state: EnvState, key: Key[Array, ""]) -> Any:
         choice, memory = player.act(memory, state, key)
-        own = fold(env.episode_key(state), jnp.full_like(state.clock, _NOISE))
-        action = jax.vmap(randomize_action)(fold(own, state.clock), chance, choice.action)
+        random = drawn[state.clock, jnp.arange(len(chance))]
+        action = jnp.where(random == _NOT_RANDOM, choice.action, random)
         return NoisyChoice(action, choice.action), with_taken_action(memory, action)
 
     return player._replace(act=act)

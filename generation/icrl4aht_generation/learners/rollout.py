@@ -130,11 +130,16 @@ def roll_out(
         outcome = env.step(carry.env, actions)
         state = restart(outcome.state, outcome.done)
         returns = carry.returns + outcome.reward
-        # Slots of environments that are done get the memory of a new episode.
-        memories = tuple(
-            select_rows(outcome.done[player.agent_slots % n], player.init(state), memory)
-            for player, (_, memory) in zip(players, acted, strict=True)
-        )
+        kept = tuple(memory for _, memory in acted)
+
+        def restart_ended() -> tuple[Any, ...]:
+            return tuple(
+                select_rows(outcome.done[player.agent_slots % n], player.init(state), memory)
+                for player, memory in zip(players, kept, strict=True)
+            )
+
+        # Slots of environments that are done get the memory of a new episode, with draws that most steps do not need.
+        memories = jax.lax.cond(jnp.any(outcome.done), restart_ended, lambda: kept)
         played = Rollout(
             record=carry.env.record,
             reset=carry.ended,
