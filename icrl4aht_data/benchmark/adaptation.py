@@ -75,11 +75,21 @@ def adaptation_table(entries: Iterable[Mapping[str, Any]], layouts: bool = True)
     return markdown_table(["set", "tasks", *EGO_KINDS, "difference", "seeds", "steps of each", "width"], rows, right=7)
 
 
-def published_adaptation_table() -> str:
-    """Return a Markdown table of the published layouts that were measured: returns of both egos, and the difference."""
+def published_adaptation_table(best: Mapping[str, float | None]) -> str:
+    """Return a Markdown table of the published layouts that were measured: returns, and two estimates of headroom.
+
+    The first estimate is the best responses' return B minus that of the episodic ego, the second the informed ego's
+    return minus that of the episodic ego, see `headroom_text`.
+
+    Args:
+        best: layout -> mean return B of the best responses over the layout's test tasks, None if it is not known.
+    """
     rows = []
     for layout, entry in published_adaptation().items():
-        means = [f"{mean:z.1f}" for mean in _mean_returns(entry)]
+        informed, episodic = _mean_returns(entry)
+        known = best.get(layout)
+        texts = ["–", "–"] if known is None else [f"{known:z.1f}", f"{known - episodic:+z.1f}"]
         steps = f"{len(entry['returns']['informed'])} x {entry['steps']:,}"
-        rows.append([layout, *means, headroom_text(entry), steps])
-    return markdown_table(["layout", *EGO_KINDS, "difference", "seeds x steps"], rows, right=4)
+        rows.append([layout, texts[0], f"{informed:z.1f}", f"{episodic:z.1f}", texts[1], headroom_text(entry), steps])
+    header = ["layout", "B", *EGO_KINDS, "B - episodic", "informed - episodic", "seeds x steps"]
+    return markdown_table(header, rows, right=6)

@@ -39,9 +39,9 @@ def measured(tmp_path, monkeypatch) -> None:
 @pytest.mark.usefixtures("measured")
 def test_only_all_test_tasks_of_a_layout_count_as_measured():
     assert published_adaptation() == {"demo_wide": ENTRY}
-    assert published_adaptation_table().splitlines()[2:] == [
-        "| demo_wide | 10.0 | 12.0 | -2.0 (-3.0 to -1.0) | 1 x 8,000 |"
-    ]
+    for best, texts in (({"demo_wide": 15.5}, "15.5 | 10.0 | 12.0 | +3.5"), ({}, "– | 10.0 | 12.0 | –")):
+        row = f"| demo_wide | {texts} | -2.0 (-3.0 to -1.0) | 1 x 8,000 |"
+        assert published_adaptation_table(best).splitlines()[2:] == [row]
 
 
 @pytest.mark.usefixtures("measured")

@@ -122,19 +122,21 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
         click.echo(f"wrote {path}")
 
 
-def _model_returns() -> dict[str, dict[str, float]]:
-    """Return model -> task id -> mean return on test tasks, from the package's stored results.
+def _model_returns() -> dict[str, dict[str, Any]]:
+    """Return model -> task id -> mean return on test tasks with each of `REPORT_SEEDS`, from the stored results.
 
     Results of controls, in which an ego's memory is cleared or another teammate plays, are left out.
     """
+    from icrl4aht_baselines.online.responses import REPORT_SEEDS
     from icrl4aht_baselines.report.comparison import read_stored, results_file
     from icrl4aht_baselines.report.results import bundled_tasks_by_id, task_label
 
     ids, stored = {task_label(task): task for task in bundled_tasks_by_id("test")}, read_stored(results_file())
     return {
         agent: {
-            ids[task]: float(values.mean())
+            ids[task]: values
             for of in cells.values()
+            if of.seeds == REPORT_SEEDS
             for task, values in zip(of.tasks, of.mean, strict=True)
         }
         for agent, cells in stored.with_other_play_modes(stored.returns()).items()

@@ -62,7 +62,8 @@ ABOUT = (
     "Best responses are recurrent PPO agents with the benchmark's 5 x 5 view. Each is trained with one teammate, with "
     "memory cleared before each episode, and imitates the oracle in the first half of the training. Episodes of seed "
     f"{CHOICE_SEEDS[0]} decide which training run is used. Returns are means over the tasks and the seeds "
-    f"{', '.join(map(str, REPORT_SEEDS))}."
+    f"{', '.join(map(str, REPORT_SEEDS))}. For each of these seeds, a stored model is used instead if it earns more "
+    "with the other two."
 )
 
 
@@ -279,26 +280,34 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainingRun]
     )
 
 
-def include_models(found: BestResponse, models: Mapping[str, Mapping[str, float]]) -> BestResponse:
-    """Replace the trained ego of a best response by the model with the highest return, if this model earns more.
+def include_models(found: BestResponse, models: Mapping[str, Mapping[str, np.ndarray]]) -> BestResponse:
+    """Replace the trained ego of a best response by a stored model if the model earns more.
+
+    An ego that is chosen by the reported episodes would be reported too high. Therefore the ego is chosen for each seed
+    of `REPORT_SEEDS` separately: models by their returns with the other seeds, the trained ego by its return with
+    `CHOICE_SEEDS`. Field `best` is the mean return of the chosen egos.
 
     Args:
         found: best response with a trained ego.
-        models: model -> task id -> mean return; models without results in all tasks of `found` are ignored.
+        models: model -> task id -> mean return with each of `REPORT_SEEDS`, float64 (3,); models without results in all
+            tasks of `found` are ignored.
     """
-    earned = {
-        name: float(np.mean([returns[task] for task in found.tasks]))
-        for name, returns in models.items()
-        if returns.keys() >= {*found.tasks}
-    }
-    name = max(earned, key=lambda name: earned[name], default=None)
-    if name is None or earned[name] <= found.best:
+    run = best_training_run(found.seeds)
+    names = [name for name, returns in models.items() if returns.keys() >= {*found.tasks}]
+    if not names:
         return found
-    return structs.replace(found, best=earned[name], agent=name)
+    earned = np.array([np.mean([models[name][task] for task in found.tasks], axis=0) for name in names])
+    others = (earned.sum(axis=1, keepdims=True) - earned) / (len(REPORT_SEEDS) - 1)  # shape (models, seeds)
+    least = -np.inf if run.choice is None else run.choice
+    of_models = np.take_along_axis(earned, others.argmax(axis=0)[None], axis=0)[0]
+    best = np.where(others.max(axis=0) > least, of_models, run.mean_return)
+    means = earned.mean(axis=1)
+    agent = names[int(means.argmax())] if means.max() > least else found.agent
+    return structs.replace(found, best=float(best.mean()), agent=agent)
 
 
 def write_responses(
-    jobs: Sequence[ResponseJob], folder: Path, models: Mapping[str, Mapping[str, float]] = MappingProxyType({})
+    jobs: Sequence[ResponseJob], folder: Path, models: Mapping[str, Mapping[str, np.ndarray]] = MappingProxyType({})
 ) -> Path:
     """Add the best responses of finished jobs to the file `RESPONSES_FILE` in a folder. Return the file's path.
 
@@ -308,7 +317,7 @@ def write_responses(
     Args:
         jobs: training jobs; unfinished jobs are skipped.
         folder: folder of the file.
-        models: model -> task id -> mean return, see `include_models`.
+        models: model -> task id -> mean returns, see `include_models`.
     """
     path, finished = folder / RESPONSES_FILE, [job for job in jobs if job.is_finished()]
     known = {one.tasks: one for one in (read_best_responses(path).behaviours if path.is_file() else ())}

@@ -6,7 +6,9 @@ import gzip
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -47,6 +49,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import add_legend_below, axis_limits, save_figure
 from icrl4aht_data.reading.arrow_tables import import_pyarrow
 from icrl4aht_data.utils.files import atomic_write, write_json
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import card_file, fill_template, markdown_table
 
 RESULTS_FILES = ("results.md", "results.png", "results.csv", "results.parquet")
@@ -55,6 +58,28 @@ CURVE_COLUMNS = ["agent", "protocol", "control", "layout", "episode", "return"]
 
 _PANELS = 6
 _SIGNIFICANT = 0.05
+
+
+class SecondaryEffect(NamedTuple):
+    """Effect with its interval, and its p-value after Holm's correction over all effects that the page tests.
+
+    Attributes:
+        effect: the mean and its 95 % interval, which is not corrected.
+        p: corrected p-value; NaN if the effect has no interval.
+    """
+
+    effect: MeanInterval
+    p: float
+
+    def text(self, digits: int, sign: str = "+") -> str:
+        """Return mean and interval as text, in bold if the mean is significantly above 0."""
+        text = self.effect.text(digits, sign)
+        return f"**{text}**" if self.effect.mean > 0 and self.p < _SIGNIFICANT else text
+
+
+SecondaryEffects = Mapping[tuple[str, ...], SecondaryEffect]
+"""All effects that the page tests besides the primary endpoint. Keys: (agent, "cleared") for M, (agent, "swapped") for
+P, (agent, "layout") for N on the track `layout`, and (track, agent, other agent) for differences of N."""
 
 
 @dataclass(frozen=True)
@@ -201,15 +226,16 @@ def render_comparison(stored: StoredResults) -> str:
     overlaps = {name for cells in results.values() for returns in cells.values() for name in returns.overlaps}
     measured, scored = read_best_responses(), cells_with_headroom(scales)
     shown = stored.with_other_play_modes(results)
+    effects = secondary_effects(stored, results, scales)
     one_way = [f"`{agent}`" for agent in results if not any(f"{agent} ({way})" in shown for way in OTHER_WAYS)]
     return fill_template(
         "results.md",
-        agents=agents_table(stored, shown, scales),
+        agents=agents_table(stored, shown, scales, effects),
         one_way=f" Not measured for: {', '.join(one_way)}." if one_way else "",
-        difference=describe_lead(results, scales),
-        controls=controls_table(stored, results, scales),
+        differences=describe_differences(effects),
+        controls=controls_table(results, scales, effects),
         layouts=layouts_table(results, scales),
-        adaptation=published_adaptation_table(),
+        adaptation=published_adaptation_table({name: mean_best_return(name, scales) for name in TEST_LAYOUTS}),
         trainings=describe_training_runs(),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
         earlier=", ".join(f"`{agent}`" for agent in every if agent not in results) or "none",
@@ -231,7 +257,34 @@ def _format_interval(value: MeanInterval | None, digits: int = 2, sign: str = ""
     return value.text(digits, sign) if value else "–"
 
 
-def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
+def secondary_effects(
+    stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales
+) -> dict[tuple[str, ...], SecondaryEffect]:
+    """Return all effects that the page tests besides the primary endpoint, see `SecondaryEffects`.
+
+    Agents are compared with the agent that has the next lower N on the track, paired by task and seed.
+    """
+    found = {}
+    for track in TRACKS:
+        cells = cells_with_headroom(scales, track)
+        scores = {agent: score.total for agent, of in results.items() if (score := find_score(of, cells, scales))}
+        if track == "layout":
+            found |= {(agent, track): total for agent, total in scores.items()}
+        for one, other in pairwise(sorted(scores, key=lambda agent: -scores[agent].mean)):
+            found[track, one, other] = score_difference(results[one], results[other], cells, scales)
+    for control, block in (("cleared", "all"), ("swapped", "last 20")):
+        others = stored.returns(control)
+        for agent, cells in results.items():
+            chosen = _controlled_cells(cells, scales)
+            difference = block_difference(cells, others.get(agent, {}), chosen, block)
+            found |= {(agent, control): difference} if difference else {}
+    corrected = holm_corrected({key: effect.p for key, effect in found.items()})
+    return {key: SecondaryEffect(effect, corrected[key]) for key, effect in found.items()}
+
+
+def agents_table(
+    stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales, effects: SecondaryEffects
+) -> str:
     """Return table 1, with a row for each agent: training data, labels, budget, and scores on each track.
 
     An agent has a score on a track only if it played all layouts and families of the track that have headroom. Rows
@@ -246,51 +299,36 @@ def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], sca
             texts = [facts.data, facts.labels, ", ".join(filter(None, (facts.steps, hours))) or "–"]
         row = [f"`{agent}`{overlap_marks(marks)}", *texts]
         for track in TRACKS:
-            score = find_score(cells, cells_with_headroom(scales, track), scales)
-            row += [_format_interval(score and score.total), _format_interval(score and score.middle)]
+            score, tested = find_score(cells, cells_with_headroom(scales, track), scales), effects.get((agent, track))
+            total = tested.text(2, "") if tested else _format_interval(score and score.total)
+            row += [total, _format_interval(score and score.middle)]
         body.append(row)
     scored = [f"{name}, {track}" for track in TRACKS for name in ("N", "IQM")]
     return markdown_table(["model", "data", "labels", "budget", *scored], body)
 
 
-def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
-    """Return a sentence on the difference between the two agents with the highest score N on the track `teammate`."""
-    cells = cells_with_headroom(scales, "teammate")
-    scores = {agent: found.total.mean for agent, of in results.items() if (found := find_score(of, cells, scales))}
-    if len(scores) < 2:
-        return "No two models have a score on the track `teammate`."
-    first, second = sorted(scores, key=scores.__getitem__, reverse=True)[:2]
-    difference = score_difference(results[first], results[second], cells, scales)
-    return (
-        f"The two models with the highest N on the track `teammate` differ by {difference.text(2, '+')}: `{first}` "
-        f"minus `{second}`, paired by task and seed."
-    )
+def describe_differences(effects: SecondaryEffects) -> str:
+    """Return a list item for each track with the differences of N between agents."""
+    lines = []
+    for track in TRACKS:
+        texts = [f"`{key[1]}` - `{key[2]}` {of.text(2)}" for key, of in effects.items() if key[0] == track]
+        lines += [f"* Track `{track}`: {', '.join(texts)}."] if texts else []
+    return "\n".join(lines) or "No two models have a score on the same track."
 
 
-def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
+def controls_table(results: Mapping[str, AgentReturns], scales: CellScales, effects: SecondaryEffects) -> str:
     """Return table 2: benefit M of memory, benefit P of the right context, and mean returns in blocks of episodes.
 
     Means are over the combinations of layout and family that the agent played and that have headroom, or over all that
-    it played if none of them has headroom. M and P are bold if they are above 0 with a p-value below 0.05, corrected
-    for all tests in the table.
+    it played if none of them has headroom.
     """
-    chosen = {agent: _controlled_cells(cells, scales) for agent, cells in results.items()}
-    found = {
-        (agent, control): block_difference(cells, others.get(agent, {}), chosen[agent], block)
-        for control, block in (("cleared", "all"), ("swapped", "last 20"))
-        for others in [stored.returns(control)]
-        for agent, cells in results.items()
-    }
-    corrected = holm_corrected({key: difference.p for key, difference in found.items() if difference})
     body = []
     for agent, cells in results.items():
-        row = [f"`{agent}`"]
-        for control in ("cleared", "swapped"):
-            difference, text = found[agent, control], _format_interval(found[agent, control], 1, "+")
-            is_clear = difference and difference.mean > 0 and corrected[agent, control] < _SIGNIFICANT
-            row.append(f"**{text}**" if is_clear else text)
+        tested = (effects.get((agent, control)) for control in ("cleared", "swapped"))
+        row = [f"`{agent}`", *(effect.text(1) if effect else "–" for effect in tested)]
         for block in EPISODE_BLOCKS:
-            parts = [cells[cell].blocks[block] for cell in chosen[agent] if block in cells[cell].blocks]
+            played = [cells[cell].blocks for cell in _controlled_cells(cells, scales)]
+            parts = [blocks[block] for blocks in played if block in blocks]
             row.append(f"{mean_over_cells(parts):z.1f}" if parts else "–")
         body.append(row)
     return markdown_table(["model", "M", "P", *EPISODE_BLOCKS], body, right=len(EPISODE_BLOCKS))
@@ -334,7 +372,7 @@ def mean_best_return(layout: str, scales: CellScales) -> float | None:
 def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return table 3: mean return on each layout, with the score N in parentheses, worst teammate, and regret.
 
-    The first rows show the reference egos and the best responses.
+    The first rows show the reference egos, the best responses, and the mean range of the training runs' returns.
     """
     scored, headroom = cells_with_headroom(scales), read_reference_returns(SUBMITTED_PROTOCOL)
     body = []
@@ -343,6 +381,10 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
         body.append([f"`{ego}`", *(f"{mean:z.1f}" for mean in means), "", ""])
     bests = [mean_best_return(name, scales) for name in TEST_LAYOUTS]
     body.append(["best response", *("–" if best is None else f"{best:z.1f}" for best in bests), "", ""])
+    ranges = training_ranges()
+    body.append(
+        ["range of runs", *(f"{ranges[name]:z.1f}" if name in ranges else "–" for name in TEST_LAYOUTS), "", ""]
+    )
     for agent, cells in results.items():
         texts = []
         for name in TEST_LAYOUTS:
@@ -354,6 +396,22 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
         worst = f"{score.worst[1]:z.2f}, {score.worst[0]}" if score else "–"
         body.append([f"`{agent}`", *texts, worst, f"{score.regret:z.1f}" if score else "–"])
     return markdown_table(["model", *TEST_LAYOUTS, "worst teammate", "regret"], body, right=len(TEST_LAYOUTS) + 2)
+
+
+def training_ranges() -> dict[str, float]:
+    """Return layout -> mean difference of the highest and lowest return of best responses' training runs.
+
+    The mean is over the test behaviours that have several training runs.
+    """
+    returns = [
+        (one.layout, [run.mean_return for run in one.seeds])
+        for one in read_best_responses().behaviours
+        if one.split == "test" and len(one.seeds) > 1
+    ]
+    return {
+        layout: float(np.mean([max(of) - min(of) for _, of in own]))
+        for layout, own in grouped(returns, lambda item: item[0]).items()
+    }
 
 
 def describe_training_runs() -> str:
@@ -383,18 +441,13 @@ def _format_range(values: Sequence[int], form: str) -> str:
 def plot_comparison(stored: StoredResults, path: Path) -> None:
     """Plot the agents' return in each episode on a log axis, with dashed lines for cleared memory.
 
-    Each of the first six layouts with headroom has a panel. An agent without stored curves has a point at the first
-    episode. Horizontal lines show `stay` and best responses.
+    Each of the first six layouts with headroom has a panel. Horizontal lines show `stay` and best responses.
     """
-    scales, results, headroom = (
-        cell_scales(SUBMITTED_PROTOCOL),
-        stored.returns(),
-        read_reference_returns(SUBMITTED_PROTOCOL),
-    )
+    scales, headroom = cell_scales(SUBMITTED_PROTOCOL), read_reference_returns(SUBMITTED_PROTOCOL)
     cells = sorted_cells(cell for cell, has_any in known_headroom(SUBMITTED_PROTOCOL).items() if has_any)
     layouts = list(dict.fromkeys(cell.layout for cell in cells))[:_PANELS]
     figure, grid = panel_grid(layouts, 3, (3.6, 3), "episode")
-    shown = [agent for agent in results if not stored.agents[agent].commit]
+    shown = [agent for agent in stored.returns() if not stored.agents[agent].commit]
     curves = {
         key: of.sort_values("episode")["return"].to_numpy()
         for key, of in stored.curves.groupby(["agent", "control", "layout"], sort=False)
@@ -406,11 +459,6 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
                 if (curve := curves.get((agent, control, layout))) is not None:
                     label = agent if not control else f"{agent}, memory cleared"
                     axes.plot(np.arange(1, len(curve) + 1), curve, style, color=color, linewidth=1.2, label=label)
-            first = [of.blocks["1"] for cell, of in results[agent].items() if cell.layout == layout]
-            if first and (agent, "", layout) not in curves:
-                axes.plot(
-                    [1], [mean_over_cells(first)], "o", color=color, markersize=4, label=f"{agent}, first episode"
-                )
         stays = [egos["stay"] for cell, egos in headroom.items() if cell[0] == layout]
         axes.axhline(np.mean(stays), color="gray", linestyle=":", label="stay")
         if (best := mean_best_return(layout, scales)) is not None:

@@ -199,16 +199,19 @@ def find_score(returns: AgentReturns, cells: Sequence[ResultCell], scales: CellS
         gains, spans, names = _gains_and_scales(returns[cell], scales[cell])
         groups[cell.layout].append(stratum_of_behaviours(gains, spans, names))
         regrets.append(spans - gains.mean(axis=(0, 2)))
+        of_cell = []
         for name in dict.fromkeys(names):
             own = [number for number, other in enumerate(names) if other == name]
             if spans[own].mean() >= LEAST_HEADROOM:
-                values.append(float(gains[:, own].mean() / spans[own].mean()))
-                labels.append(f"{cell.layout} {cell.family}")
-    worst = int(np.argmin(values))
+                of_cell.append(float(gains[:, own].mean() / spans[own].mean()))
+        if of_cell:
+            values.append(np.array(of_cell))
+            labels.append(f"{cell.layout} {cell.family}")
+    worst, label = min((of_cell.min(), label) for of_cell, label in zip(values, labels, strict=True))
     return Score(
         total=ratio_interval([*groups.values()]),
-        middle=interquartile_mean(np.array(values)),
-        worst=(labels[worst], values[worst]),
+        middle=interquartile_mean(*values),
+        worst=(label, float(worst)),
         regret=float(np.concatenate(regrets).mean()),
     )
 

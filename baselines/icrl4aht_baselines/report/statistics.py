@@ -144,17 +144,31 @@ def _estimate(groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R
     return mean, variance
 
 
-def interquartile_mean(values: Float[np.ndarray, " U"]) -> MeanInterval:
-    """Return the interquartile mean of values, with its BCa bootstrap interval (Agarwal et al. 2021)."""
-    mean = float(trim_mean(values, 0.25))
-    if len(values) <= _LEAST_FREEDOM:
+def interquartile_mean(*strata: Float[np.ndarray, " _"]) -> MeanInterval:
+    """Return the interquartile mean of all values, with its BCa bootstrap interval (Agarwal et al. 2021).
+
+    Args:
+        strata: values that are resampled separately, float64 (U,) each; strata of one value are joined with others.
+    """
+    parts = [values for values in strata if len(values) > 1]
+    single = [values for values in strata if len(values) == 1]
+    if single:  # a stratum needs two values to be resampled
+        parts = [np.concatenate([*single, *parts[:1]]), *parts[1:]]
+
+    def middle(*values: np.ndarray, axis: int = -1) -> np.ndarray:
+        return trim_mean(np.concatenate(values, axis=axis), 0.25, axis=axis)
+
+    mean = float(middle(*parts))
+    if sum(map(len, parts)) <= _LEAST_FREEDOM:
         return MeanInterval(mean)
-    jackknife = [trim_mean(np.delete(values, number), 0.25) for number in range(len(values))]
-    if np.ptp(jackknife) < 1e-9:  # BCa divides by the variance of the jackknife means
+    left_out = [
+        [middle(*parts[:number], np.delete(values, place), *parts[number + 1 :]) for place in range(len(values))]
+        for number, values in enumerate(parts)
+    ]
+    if max(map(np.ptp, left_out)) < 1e-9:  # BCa divides by the variance of the jackknife means
         return MeanInterval(mean)
     options = {"n_resamples": _RESAMPLES, "method": "BCa", "vectorized": True, "rng": np.random.default_rng(0)}
-    found = bootstrap((values,), lambda x, axis: trim_mean(x, 0.25, axis=axis), **options)
-    return MeanInterval(mean, *map(float, found.confidence_interval))
+    return MeanInterval(mean, *map(float, bootstrap(parts, middle, **options).confidence_interval))
 
 
 def holm_corrected(p_values: Mapping[_Key, float]) -> dict[_Key, float]:

@@ -71,12 +71,18 @@ def test_best_response_is_chosen_on_separate_episodes(tmp_path):
     second = read_best_responses(path)
     assert second.behaviours == (entry,)
     assert second.version != first.version
-    models = {"better": {DEMO[0].task_id: 9.5}, "worse": {DEMO[0].task_id: 8.0}, "elsewhere": {"other": 50.0}}
-    responses.write_responses(jobs, tmp_path, models)
+    models = {name: {DEMO[0].task_id: np.array(of)} for name, of in
+              {"better": (12.0, 9.0, 12.0), "lucky": (0.0, 0.0, 30.0), "worse": (8.0, 8.0, 8.0)}.items()}  # fmt: skip
+    responses.write_responses(jobs, tmp_path, models | {"elsewhere": {"other": np.full(3, 50.0)}})
     (third,) = read_best_responses(path).behaviours
-    assert (third.best, third.agent, third.seeds) == (9.5, "better", entry.seeds)
-    row = "| demo_wide | test | H1 t0 | 9.5 | better | 9.0 to 20.0 | 2 | 400 | 128 | +0.0 |"
+    # With the other two seeds, `lucky` earns 15 for seeds 0 and 1, and `better` 10.5 for seed 2; the trained ego's
+    # choice is 10. Thus the chosen egos earn 0, 0 and 12 in the seeds that did not decide.
+    assert (third.best, third.agent, third.seeds) == (4.0, "better", entry.seeds)
+    row = "| demo_wide | test | H1 t0 | 4.0 | better | 9.0 to 20.0 | 2 | 400 | 128 | +0.0 |"
     assert row in responses.responses_table(tmp_path)
+    responses.write_responses(jobs, tmp_path, {"worse": models["worse"]})
+    (fourth,) = read_best_responses(path).behaviours
+    assert (fourth.best, fourth.agent) == (9.0, "best response, seed 0")
     pair = ResponseJob((DEMO[0], DEMO[1]), 0, TINY, tmp_path / "pair")
     write_finished_job(pair, choice=1.0, earned=1.0)
     responses.write_responses([pair], tmp_path)

@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from icrl4aht_baselines.report import comparison
-from icrl4aht_baselines.report.comparison import StoredResults
+from icrl4aht_baselines.report.comparison import SecondaryEffect, StoredResults
 from icrl4aht_baselines.report.scores import add_scales, cell_scales
+from icrl4aht_baselines.report.statistics import MeanInterval, holm_corrected
 from icrl4aht_baselines.report.submission import AgentFacts, make_submission
 from msgspec import structs
 
@@ -40,6 +41,10 @@ def stored(tmp_path_factory) -> StoredResults:
     return found
 
 
+def effects(stored: StoredResults) -> dict[tuple[str, ...], SecondaryEffect]:
+    return comparison.secondary_effects(stored, stored.returns(), cell_scales("seeded"))
+
+
 def agent_row(table: str, agent: str) -> list[str]:
     (line,) = [line for line in table.splitlines() if line.startswith(f"| `{agent}` ")]
     return [cell.strip() for cell in line.strip("|").split(" | ")]
@@ -58,29 +63,44 @@ def test_stored_results_have_episode_blocks_and_curves_and_can_be_read_again(sto
 
 def test_agents_table_has_scores_of_complete_tracks_only(stored, invented_responses):
     scales = cell_scales("seeded")
-    table = comparison.agents_table(stored, stored.returns(), scales)
+    table = comparison.agents_table(stored, stored.returns(), scales, effects(stored))
     high, low = agent_row(table, "high"), agent_row(table, "low")
     assert high[1:6] == ["noise", "oracle", "10 updates, 2 core-hours", "–", "–"], "no track teammate"
     # Score: (return - stay) / 20; the mean return of `stay` is 12.0 on asymm_right and 0.0 on cramped_down.
     stays = np.mean([np.mean([scale.stay for cell, scale in scales.items() if cell.layout == name])
                      for name in ("asymm_right", "cramped_down")])  # fmt: skip
     for found, mean in ((high, 21.5), (low, 9.5)):
-        assert found[6].startswith(f"{(mean - stays) / 20:z.2f} (")
-    assert comparison.describe_lead(stored.returns(), scales) == "No two models have a score on the track `teammate`."
+        assert found[6].startswith(f"**{(mean - stays) / 20:z.2f} (")
+    weak = comparison.SecondaryEffect(MeanInterval(0.5, 0.1, 0.9, p=0.02), p=0.06)
+    assert weak.text(1) == "+0.5 (+0.1 to +0.9)", "bold only if the corrected p-value is below 0.05"
+    (line,) = comparison.describe_differences(effects(stored)).splitlines()
+    assert line.startswith("* Track `layout`: `high` - `low` **+0.60 (") and line.endswith(")**.")
+    assert comparison.describe_differences({}) == "No two models have a score on the same track."
 
 
-def test_lead_is_the_difference_of_the_two_highest_scores(tmp_path, invented_responses):
+def test_differences_are_between_agents_with_neighbouring_scores(tmp_path, invented_responses):
     one, found = make_submission([write_results(tmp_path, "a", [0.0] * 100, "teammate")], FACTS), StoredResults()
     for name, value in {"a": 3.0, "b": 9.0, "c": 5.0}.items():
         returns = dict.fromkeys(one.evaluations[0].returns, [[value] * 100] * 3)
         of_agent = structs.replace(one, agent=name, evaluations=[structs.replace(one.evaluations[0], returns=returns)])
         found = comparison.add_submission(found, of_agent)
-    lead = comparison.describe_lead(found.returns(), cell_scales("seeded"))
-    assert "differ by +0.20 (+0.20 to +0.20): `b` minus `c`" in lead
+    assert comparison.describe_differences(effects(found)) == (
+        "* Track `teammate`: `b` - `c` **+0.20 (+0.20 to +0.20)**, `c` - `a` **+0.10 (+0.10 to +0.10)**."
+    )
+
+
+def test_p_values_are_corrected_over_all_effects(stored, invented_responses):
+    """The five effects are N of both agents and their difference on track `layout`, and M and P of `high`."""
+    found = effects(stored)
+    assert {*found} == {
+        ("high", "layout"), ("low", "layout"), ("layout", "high", "low"), ("high", "cleared"), ("high", "swapped"),
+    }  # fmt: skip
+    assert {key: of.p for key, of in found.items()} == holm_corrected({key: of.effect.p for key, of in found.items()})
+    assert found["high", "cleared"].p >= 4 * found["high", "cleared"].effect.p
 
 
 def test_controls_table_has_memory_and_partner_controls_and_episode_blocks(stored, invented_responses):
-    table = comparison.controls_table(stored, stored.returns(), cell_scales("seeded"))
+    table = comparison.controls_table(stored.returns(), cell_scales("seeded"), effects(stored))
     high, low = agent_row(table, "high"), agent_row(table, "low")
     assert high[1].startswith("**+15.5 (") and high[1].endswith(")**"), "19.5 + 2 - (5 + 1)"
     assert high[2] == "+0.0 (+0.0 to +0.0)" and high[3:] == ["12.0", "12.0", "22.0", "22.0"]
@@ -114,7 +134,7 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
     paths = comparison.write_comparison(some, tmp_path / "page")
     assert [path.name for path in paths] == [*comparison.RESULTS_FILES]
     text = paths[0].read_text(encoding="utf-8")
-    assert f"Other layouts were not measured.\n\n{published_adaptation_table()}\n" in text
+    assert f"Other layouts were not measured.\n\n{published_adaptation_table({})}\n" in text
     assert "| `high` | noise | oracle | 10 updates, 2 core-hours | – |" in text and "| `low`" not in text
     assert "These models were trained with earlier code: `low`." in text and "None measured (version" in text
     assert paths[1].stat().st_size > 10_000

@@ -57,7 +57,17 @@ def test_interval_of_a_ratio_is_wider_over_several_training_runs():
 def test_interquartile_mean_drops_a_quarter_of_values_at_each_end():
     found = interquartile_mean(np.array([-100.0, 0, 1, 2, 3, 4, 5, 900]))
     assert found.mean == 2.5 and found.low < 2.5 < found.high
-    assert np.isnan(interquartile_mean(np.ones(3)).low)
+    assert np.isnan(interquartile_mean(np.ones(3)).low) and np.isnan(interquartile_mean(np.ones(1), np.ones(5)).low)
+
+
+def test_interquartile_mean_resamples_strata_separately():
+    """Values differ between strata more than within: stratified resampling gives a narrower interval."""
+    strata = [5.0 * number + np.array([0.0, 0.1, 0.2, 0.4]) for number in range(4)]
+    joined, separate = interquartile_mean(np.concatenate(strata)), interquartile_mean(*strata)
+    assert joined.mean == separate.mean and separate.high - separate.low < 0.3 * (joined.high - joined.low)
+    assert interquartile_mean(*strata, np.array([7.0])).mean == pytest.approx(
+        interquartile_mean(np.append(np.concatenate(strata), 7.0)).mean
+    )
 
 
 def test_holm_corrects_p_values():
