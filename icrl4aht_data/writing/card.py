@@ -27,6 +27,7 @@ from icrl4aht_data.benchmark.facts import (
     SAME_BEHAVIOUR,
     SOURCES,
     SPLITS,
+    SPREAD_SEED,
     TESTED_ON,
     TRACKS,
     family_sort_key,
@@ -326,7 +327,9 @@ def _behaviour_counts(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Count teammates with known behaviour and distinct behaviours by split, and behaviours that both splits share."""
     known = [row for row in teammates if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None]
     found = {
-        split: [(row["layout"], row["family"], row["nearest_test"]["behaviour"]) for row in own]
+        split: [
+            (row["layout"], row["family"], row["seed"] == SPREAD_SEED, row["nearest_test"]["behaviour"]) for row in own
+        ]
         for split, own in grouped(known, lambda row: row["split"]).items()
     }
     counts = {split: (len(found[split]), len(set(found[split]))) for split in SPLITS if split in found}

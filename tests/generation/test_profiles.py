@@ -302,6 +302,10 @@ H3 = 'families = ["assembly_line"]'
         ("presets =", f"spread = {{ {H3}, per_layout = 1 }}\npresets =", "families"),
         ("presets =", f"sampled = {{ {H3}, per_layout = 1, validation = 1 }}\npresets =", "validation"),
         ("total_steps = 32000", "total_steps = 13500", "total_steps"),
+        ("[release]", "[teammates]\nmembers = 2\ntrain = 40\n[release]", "train = 40, .* at most 10 together"),
+        ('"coord_simple"', '"asymm_right"', "train split of track layout 'asymm_right'; valid: asymm_both"),
+        ("presets =", 'sources = ["agent"]\npresets =', "agent"),
+        ("presets =", 'sources = ["search"]\npreference = ["demo_wide"]\npresets =', "demo_wide"),
         ("[ego]", "[ego", r"Expected '\]' at the end of a table declaration \(at line 2"),
     ],
 )

@@ -39,10 +39,14 @@ BYTES_PER_STEP: dict[tuple[Kind, str], float] = {
     ("lite", "search"): 1.52,
     ("full", "search"): 12.01,
 }
-"""Bytes of a transition in a release, by kind and source, measured on the bundled release."""
+"""Bytes of a transition in a release's shards, by kind and source, measured on the bundled release."""
 
 BYTES_PER_HISTORY = {"search": 570}
-"""Additional bytes of each history by source, for sources with short histories (measured at 500 and 1,000 steps)."""
+"""Additional bytes of each history in shards, for sources with short histories (measured at 500 and 1,000 steps)."""
+
+META_BYTES = {"transitions": 0.12, "histories": 900, "tasks": 1400}
+"""Bytes of the index and the hashes of a release for each transition, history and task, measured on the bundled
+release."""
 
 ENVIRONMENT_STEPS_PER_SECOND = 180_000.0
 """Steps per second of the environment with a scripted teammate on 2 CPU cores."""
@@ -96,6 +100,7 @@ def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
             tasks += count
             if source == "ppo":
                 egos += [(layout, profile.ego_config(name))] * (count * profile.learners)
+                histories[source] += count * profile.keep
                 kept[source] += count * profile.keep * profile.ego_config(name).episodes * KEPT_STEPS
             else:
                 config = profile.scripted_config(name, source)
@@ -110,7 +115,9 @@ def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
     scripted_seconds = [count / ENVIRONMENT_STEPS_PER_SECOND + SCRIPTED_SECONDS for count in transitions]
     seconds = [played + COMPILE_SECONDS for played in playing] + scripted_seconds
     teammate_seconds = sum(run.steps * step_seconds(run.config) + COMPILE_SECONDS for run in runs)
+    counts = {"transitions": kept.total(), "histories": histories.total(), "tasks": tasks}
     extra = sum(histories[source] * more for source, more in BYTES_PER_HISTORY.items())
+    extra += sum(count * META_BYTES[name] for name, count in counts.items())
     sizes = {kind: round(extra + sum(kept[each] * BYTES_PER_STEP[kind, each] for each in kept)) for kind in KINDS}
     device = jax.devices()[0]
     return {

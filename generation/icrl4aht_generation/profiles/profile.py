@@ -15,6 +15,7 @@ from icrl4aht_data.benchmark.facts import (
     PREFERENCE,
     PREFERENCE_LAYOUTS,
     SOURCES,
+    SPREAD_SEED,
     layout_track,
 )
 from icrl4aht_data.benchmark.tasks import Task, make_task, manifest_path, read_tasks
@@ -23,11 +24,12 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.options import Count, Natural, check_options, replace_options
 from icrl4aht_generation.layouts.families import split_of
+from icrl4aht_generation.learners.checkpoint import POLICY_CHECKPOINTS
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.teammates.draws import drawn_teammates
 from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_teammate
-from icrl4aht_generation.teammates.spread import SPREAD_SEED, spread_teammates
+from icrl4aht_generation.teammates.spread import spread_teammates
 
 LEAST_EPISODES = 5
 """Minimum number of episodes of a history, because its initial and final returns are means over five episodes."""
@@ -85,6 +87,12 @@ class TeammateConfig:
 
     def __post_init__(self) -> None:
         check_options(self)
+        most = self.members * POLICY_CHECKPOINTS
+        if self.train + self.heldout > most:
+            raise OptionError(
+                f"teammates.train = {self.train}, teammates.heldout = {self.heldout}: expected at most {most} "
+                f"together, {POLICY_CHECKPOINTS} checkpoints of each of {self.members} members"
+            )
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, layout_sort_key
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, SPREAD_SEED, TESTED_ON, layout_sort_key
 from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_generation.teammates.draws import Draw, equal_parameters, find_draw, read_measured
@@ -36,9 +36,6 @@ from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, heuristic
 
 SPREAD_TABLE = Path(__file__).with_name("spread.jsonl")
 """Path of the table of the chosen teammates."""
-
-SPREAD_SEED = 4
-"""base_seed of spread teammates; their `theta_id` is the candidate's number in the family, see `spread_candidates`."""
 
 _DRAWS = 32
 """Number of diverse sampled teammates of each family among the candidates."""

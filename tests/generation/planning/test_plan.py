@@ -38,8 +38,9 @@ def test_cost_of_profile_paper_matches_numbers_of_the_paper(fixed_speeds):
     assert found["teammate_hours"] == pytest.approx(teammate_hours, abs=0.01)
     assert found["hours_on_one"] == pytest.approx(640 * hours + teammate_hours, abs=0.01)
     assert found["hours_on_devices"] == pytest.approx(40 * hours + teammate_hours, abs=0.01)
-    assert found["lite_bytes"] == pytest.approx(1.92 * found["kept_transitions"])
-    assert found["full_bytes"] == pytest.approx(9.23 * found["kept_transitions"])
+    meta = 640 * (128 * 900 + 1400) + 0.12 * found["kept_transitions"]
+    assert found["lite_bytes"] == pytest.approx(1.92 * found["kept_transitions"] + meta)
+    assert found["full_bytes"] == pytest.approx(9.23 * found["kept_transitions"] + meta)
 
 
 def test_cost_of_noise_histories_includes_no_learners(tmp_path):
@@ -61,6 +62,7 @@ def test_cost_of_noise_histories_includes_no_learners(tmp_path):
 def test_estimated_sizes_match_the_bundled_release():
     dataset = load_icrl4aht()
     shards = sum(path.stat().st_size for path in (dataset.root / "data").rglob("*.h5"))
+    meta = sum(path.stat().st_size for path in (dataset.root / "meta").rglob("*") if path.is_file())
     # Histories of the source `agent` are left out, since there are only a few.
     made = [entry for entry in dataset.entries if entry.source != "agent"]
     expected = sum(
@@ -68,6 +70,12 @@ def test_estimated_sizes_match_the_bundled_release():
         for entry in made
     )
     assert shards == pytest.approx(expected, rel=0.1)
+    counts = {
+        "transitions": sum(entry.T for entry in dataset.entries),
+        "histories": len(dataset),
+        "tasks": len({entry.task_id for entry in dataset.entries}),
+    }
+    assert meta == pytest.approx(sum(counts[name] * size for name, size in plan.META_BYTES.items()), rel=0.1)
 
 
 def test_plan_command_measures_speed_and_prints_costs(built):

@@ -20,7 +20,6 @@ from icrl4aht_generation.teammates.preference import WATCHER
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, check_theta, sample_teammate
 from icrl4aht_generation.teammates.spread import (
     MOST_CHOSEN,
-    SPREAD_SEED,
     LayoutSpread,
     SpreadTeammate,
     choose_spread,
@@ -31,7 +30,7 @@ from icrl4aht_generation.teammates.spread import (
     spread_teammates,
 )
 
-from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TESTED_ON
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SPREAD_SEED, TESTED_ON
 from icrl4aht_data.benchmark.tasks import teammate_id
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
