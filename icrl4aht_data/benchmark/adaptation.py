@@ -78,11 +78,11 @@ def adaptation_table(entries: Iterable[Mapping[str, Any]], layouts: bool = True)
 def published_adaptation_table(best: Mapping[str, float | None]) -> str:
     """Return a Markdown table of the published layouts that were measured: returns, and two estimates of headroom.
 
-    The first estimate is the best responses' return B minus that of the episodic ego, the second the informed ego's
-    return minus that of the episodic ego, see `headroom_text`.
+    The first estimate is B minus the episodic ego's return, the second the informed ego's return minus that of the
+    episodic ego, see `headroom_text`.
 
     Args:
-        best: layout -> mean return B of the best responses over the layout's test tasks, None if it is not known.
+        best: layout -> B, the mean of the best known returns over the layout's test tasks; None if it is not known.
     """
     rows = []
     for layout, entry in published_adaptation().items():

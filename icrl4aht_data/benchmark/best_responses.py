@@ -1,7 +1,8 @@
 """Best responses: for each teammate, the highest known return of an ego that sees only its own observations.
 
 The file `cards/best_responses.json` stores the best responses. Each is the return of a recurrent ego trained with one
-teammate, or of another model that earns more. Tasks whose teammates behave the same share a best response.
+teammate, or of stored models that earn more in other episodes. Tasks whose teammates behave the same share a best
+response.
 """
 
 from __future__ import annotations
@@ -52,8 +53,8 @@ class BestResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         split: split of the tasks.
         tasks: ids of the tasks whose teammates show this behaviour.
         seeds: training runs of egos with a teammate of this behaviour.
-        best: highest mean return of any ego that sees only its own observations.
-        agent: name of the ego that earns the highest return, such as "best response, seed 1".
+        best: mean return of the best ego that sees only its own observations; the ego is chosen by other episodes.
+        agent: name of the ego that is the best in all episodes, such as "best response, seed 1".
     """
 
     layout: str

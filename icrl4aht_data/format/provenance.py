@@ -158,8 +158,8 @@ class NearestTestTeammate(Struct, frozen=True, omit_defaults=True):
     Args:
         teammate: family and number of the test teammate, such as "H3/t1".
         distance: fraction of states in which the two teammates choose different actions.
-        behaviour: id of the behaviour of the task's teammate; teammates of one layout and family with equal ids behave
-            the same. None if unknown.
+        behaviour: id of the behaviour of the task's teammate; drawn teammates of one layout and family with equal ids
+            behave the same. Spread teammates have ids of their own. None if unknown.
     """
 
     teammate: str

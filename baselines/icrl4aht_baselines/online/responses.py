@@ -62,8 +62,8 @@ ABOUT = (
     "Best responses are recurrent PPO agents with the benchmark's 5 x 5 view. Each is trained with one teammate, with "
     "memory cleared before each episode, and imitates the oracle in the first half of the training. Episodes of seed "
     f"{CHOICE_SEEDS[0]} decide which training run is used. Returns are means over the tasks and the seeds "
-    f"{', '.join(map(str, REPORT_SEEDS))}. For each of these seeds, a stored model is used instead if it earns more "
-    "with the other two."
+    f"{', '.join(map(str, REPORT_SEEDS))}. For each of these seeds, the stored model that earns most with the other "
+    f"two is used instead if it earns more with them than the training run with seed {CHOICE_SEEDS[0]}."
 )
 
 
@@ -276,23 +276,29 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainingRun]
         tasks=tuple(one.task_id for one in tasks),
         seeds=tuple(seeds.values()),
         best=best.mean_return,
-        agent=f"best response, seed {best.seed}" + (f" from {best.init}" if best.init else ""),
+        agent=_ego_name(best),
     )
 
 
-def include_models(found: BestResponse, models: Mapping[str, Mapping[str, np.ndarray]]) -> BestResponse:
-    """Replace the trained ego of a best response by a stored model if the model earns more.
+def _ego_name(run: TrainingRun) -> str:
+    return f"best response, seed {run.seed}" + (f" from {run.init}" if run.init else "")
 
-    An ego that is chosen by the reported episodes would be reported too high. Therefore the ego is chosen for each seed
-    of `REPORT_SEEDS` separately: models by their returns with the other seeds, the trained ego by its return with
-    `CHOICE_SEEDS`. Field `best` is the mean return of the chosen egos.
+
+def include_models(found: BestResponse, models: Mapping[str, Mapping[str, np.ndarray]]) -> BestResponse:
+    """Choose between the trained ego of a best response and stored models.
+
+    The return of an ego that is chosen by the reported episodes would be too high. Therefore an ego is chosen for each
+    seed of `REPORT_SEEDS` separately: the model with the highest mean return with the other seeds, or the trained ego
+    if its return with `CHOICE_SEEDS` is as high. Field `best` of the result is the mean return of these egos. Field
+    `agent` is the ego that would be chosen by all seeds.
 
     Args:
-        found: best response with a trained ego.
+        found: best response; its training runs are used, and its fields `best` and `agent` are replaced.
         models: model -> task id -> mean return with each of `REPORT_SEEDS`, float64 (3,); models without results in all
             tasks of `found` are ignored.
     """
     run = best_training_run(found.seeds)
+    found = structs.replace(found, best=run.mean_return, agent=_ego_name(run))
     names = [name for name, returns in models.items() if returns.keys() >= {*found.tasks}]
     if not names:
         return found

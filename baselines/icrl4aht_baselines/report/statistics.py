@@ -148,18 +148,20 @@ def interquartile_mean(*strata: Float[np.ndarray, " _"]) -> MeanInterval:
     """Return the interquartile mean of all values, with its BCa bootstrap interval (Agarwal et al. 2021).
 
     Args:
-        strata: values that are resampled separately, float64 (U,) each; strata of one value are joined with others.
+        strata: values that are resampled separately, float64 (U,) each; strata of one value form a stratum together.
     """
     parts = [values for values in strata if len(values) > 1]
     single = [values for values in strata if len(values) == 1]
-    if single:  # a stratum needs two values to be resampled
-        parts = [np.concatenate([*single, *parts[:1]]), *parts[1:]]
+    if len(single) == 1:  # a stratum needs two values to be resampled
+        parts[:1] = [np.concatenate([*single, *parts[:1]])]
+    elif single:
+        parts.append(np.concatenate(single))
 
     def middle(*values: np.ndarray, axis: int = -1) -> np.ndarray:
         return trim_mean(np.concatenate(values, axis=axis), 0.25, axis=axis)
 
     mean = float(middle(*parts))
-    if sum(map(len, parts)) <= _LEAST_FREEDOM:
+    if sum(len(values) - 1 for values in parts) < _LEAST_FREEDOM:
         return MeanInterval(mean)
     left_out = [
         [middle(*parts[:number], np.delete(values, place), *parts[number + 1 :]) for place in range(len(values))]

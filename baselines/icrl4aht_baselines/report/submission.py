@@ -46,7 +46,7 @@ class AgentFacts(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True)
         about: one sentence on how the agent was made.
         data: training data in a few words, such as "noise histories"; "none" for an agent that was not trained.
         labels: training targets in a few words, such as "oracle"; "none" without targets.
-        steps: length of the training, such as "4,000 updates".
+        steps: length of the training, such as "41 million steps a track".
         core_hours: core-hours of the training and of making its data.
         link: address of a paper or repository.
         commit: commit of this repository whose code made the agent, if later code cannot make it.

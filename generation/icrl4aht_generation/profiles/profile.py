@@ -74,6 +74,9 @@ class TeammateConfig:
         train: number of teammates of each algorithm for training tasks.
         heldout: number of additional teammates of each algorithm, for the in-distribution check.
         ppo: hyper-parameters of every policy.
+
+    Raises:
+        OptionError: if the populations have fewer checkpoints than requested teammates.
     """
 
     members: Count = 10

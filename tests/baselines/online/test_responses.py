@@ -80,7 +80,7 @@ def test_best_response_is_chosen_on_separate_episodes(tmp_path):
     assert (third.best, third.agent, third.seeds) == (4.0, "better", entry.seeds)
     row = "| demo_wide | test | H1 t0 | 4.0 | better | 9.0 to 20.0 | 2 | 400 | 128 | +0.0 |"
     assert row in responses.responses_table(tmp_path)
-    responses.write_responses(jobs, tmp_path, {"worse": models["worse"]})
+    responses.write_responses([], tmp_path, {"worse": models["worse"]})
     (fourth,) = read_best_responses(path).behaviours
     assert (fourth.best, fourth.agent) == (9.0, "best response, seed 0")
     pair = ResponseJob((DEMO[0], DEMO[1]), 0, TINY, tmp_path / "pair")

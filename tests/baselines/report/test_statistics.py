@@ -57,6 +57,8 @@ def test_interval_of_a_ratio_is_wider_over_several_training_runs():
 def test_interquartile_mean_drops_a_quarter_of_values_at_each_end():
     found = interquartile_mean(np.array([-100.0, 0, 1, 2, 3, 4, 5, 900]))
     assert found.mean == 2.5 and found.low < 2.5 < found.high
+    few = interquartile_mean(np.array([0.0, 1.0]), np.array([2.0, 4.0]))
+    assert few.mean == 1.5 and np.isnan(few.low), "two degrees of freedom"
     assert np.isnan(interquartile_mean(np.ones(3)).low) and np.isnan(interquartile_mean(np.ones(1), np.ones(5)).low)
 
 
