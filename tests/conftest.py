@@ -33,7 +33,7 @@ MEMORY_TO_FREE = 1200 * 2**20
 SharedFolder = Callable[[str, Callable[[Path], object]], Path]
 COMPILATION_CACHE: dict[str, Any] = {
     "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".cache" / "jax"),
-    "jax_compilation_cache_max_size": 2 * 2**30,  # with a limit, JAX locks the folder, so processes can share the cache
+    "jax_compilation_cache_max_size": 2 * 2**30,  # with a limit, JAX locks the folder, which processes share
     "jax_persistent_cache_min_compile_time_secs": 0.1,  # with 0.5, tests take 50% more CPU time (cache filled)
 }
 COSTLIEST = """

@@ -1,4 +1,4 @@
-"""Measure the reference egos on every test task, and write the returns into the package's cards."""
+"""Evaluate the reference egos on every test task, and write their mean returns to the folder cards/."""
 
 from __future__ import annotations
 

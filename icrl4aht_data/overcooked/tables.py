@@ -278,7 +278,7 @@ def _make_view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> n
     for bit, ingredient in enumerate(layout.ingredients):
         pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
         fixed |= pile.astype(np.int32) << (_PILES - FIXED_BIT + bit)
-    # Positions outside the map have the cell number NOWHERE, no fixed bits, and word 0, which is always zero.
+    # A position outside the map gets the cell number NOWHERE, and 0 in all other bits.
     packed = changing | fixed << 8 | np.arange(layout.cells) << CELL_BIT
     return np.where(layout.window >= 0, packed[layout.window], NOWHERE << CELL_BIT).astype(np.int32)
 

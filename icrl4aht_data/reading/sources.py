@@ -248,7 +248,7 @@ class StreamedSource:
         positions = {position for request in requests for position in request.histories.tolist()}
         names = sorted({self._entries[position].shard for position in positions})
         self._shards.fetch(names)
-        for name in names:  # opened in advance, since two threads could open the same shard
+        for name in names:  # opened here, because two threads could open the same shard
             self._shards.open(name)
         _read_in_threads(self._read, requests, self._threads)
 

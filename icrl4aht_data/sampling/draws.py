@@ -202,7 +202,7 @@ def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[n
             raise TypeError
         first, stop = episodes
         bounds = slice(first, stop)
-        # Histories have few different numbers of episodes, so the Python loop is short.
+        # Most histories have equally many episodes, so the Python loop is short.
         distinct, number = np.unique(counts, return_inverse=True)
         first, stop = np.array([bounds.indices(count)[:2] for count in distinct.tolist()], np.int64)[number].T
     except (TypeError, ValueError) as error:

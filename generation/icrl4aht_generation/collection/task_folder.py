@@ -270,7 +270,7 @@ class ArrayWriter:
         self._recording += time.perf_counter() - began
 
     def timing(self, steps: int) -> dict[str, float]:
-        """Add `steps` to the counted steps, and return steps per second, total seconds and seconds of recording.
+        """Count `steps` more steps, and return steps per second, total seconds and seconds spent on recording.
 
         Measurement starts after the first batch, because that batch includes compilation.
         """

@@ -300,7 +300,7 @@ def _label_function(found: TaskHistories, labeller: Path | None) -> Callable[[in
 
 
 def _recorded_histories(found: TaskHistories) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
-    """Yield learner, stream and memory-mapped arrays of each selected history."""
+    """Yield the learner's number, the stream's number and the memory-mapped arrays of each selected history."""
     for learner, (folder, streams) in enumerate(zip(found.folders, found.streams, strict=True)):
         arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in HISTORY_ARRAYS}
         dones = episode_ends(arrays["actions"].shape[1], KEPT_STEPS)

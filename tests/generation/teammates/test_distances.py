@@ -29,7 +29,7 @@ LAYOUT = get_layout("cramped_up")
 
 
 def test_distance_is_measured_on_states_of_the_test_teammates_family():
-    """The example has two families of five test teammates, and one episode of two steps for each family."""
+    """The example has two families with five test teammates each, and one episode of two steps for each family."""
     tested = np.zeros((10, 2, 2), np.int8)
     tested[3, :, 0], tested[7, :, 1] = 1, [2, 4]
     actions = np.array([[[1, 2], [1, 3]], [[0, 0], [1, 4]]], np.int8)  # shape (teammates, T, episodes)

@@ -1,4 +1,4 @@
-"""Test that `verify_release` finds false values in meta/ although the manifest matches the files."""
+"""Test that `verify_release` finds wrong values in meta/ even if the manifest matches the files."""
 
 from __future__ import annotations
 

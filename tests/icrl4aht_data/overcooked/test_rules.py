@@ -27,7 +27,7 @@ from tests.helpers.states import state_record
 
 CRAMPED, ASYMM, RING = (LAYOUTS[name] for name in ("cramped_up", "asymm_both", "coord_ring"))
 
-PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO: one piece of ingredient 0, ONE: one piece of ingredient 1
+PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # bytes of items; ZERO is one piece of ingredient 0
 RECIPE_000, RECIPE_001, RECIPE_111 = 3 * ZERO, 2 * ZERO + ONE, 3 * ONE
 SOUP_000, SOUP_001, SOUP_111 = (recipe + COOKED for recipe in (RECIPE_000, RECIPE_001, RECIPE_111))
 DISH_000, DISH_001, DISH_111 = (soup + PLATE for soup in (SOUP_000, SOUP_001, SOUP_111))
