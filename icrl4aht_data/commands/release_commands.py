@@ -327,7 +327,9 @@ def convert(
         advance(0, None)  # the total is unknown before the first history
         if isinstance(root, Path) and (root / HISTORIES_H5).exists():
             if (form is not None and form not in ALL_KINDS) or any(filters.values()):
-                raise click.UsageError("published files can only be converted to full, lite or observations, and without filters")
+                raise click.UsageError(
+                    "published files can only be converted to full, lite or observations, and without filters"
+                )
             form = from_published(
                 root,
                 target,
