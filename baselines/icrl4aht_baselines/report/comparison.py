@@ -40,7 +40,7 @@ from icrl4aht_baselines.report.scores import (
 )
 from icrl4aht_baselines.report.statistics import MeanInterval, holm_corrected
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission
-from icrl4aht_baselines.training.seen import overlap_legend, overlap_marks
+from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.adaptation import published_adaptation_table
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -223,7 +223,6 @@ def render_comparison(stored: StoredResults) -> str:
     """Return the text of docs/results.md. Tables leave out agents of older code, see `AgentFacts.commit`."""
     scales, every = cell_scales(SUBMITTED_PROTOCOL), stored.returns()
     results = {agent: cells for agent, cells in every.items() if not stored.agents[agent].commit}
-    overlaps = {name for cells in results.values() for returns in cells.values() for name in returns.overlaps}
     measured, scored = read_best_responses(), cells_with_headroom(scales)
     shown = stored.with_other_play_modes(results)
     effects = secondary_effects(stored, results, scales)
@@ -239,7 +238,6 @@ def render_comparison(stored: StoredResults) -> str:
         trainings=describe_training_runs(),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
         earlier=", ".join(f"`{agent}`" for agent in every if agent not in results) or "none",
-        marks="\n".join(f"* {text}" for text in overlap_legend(overlaps)),
         measured=f"{measured.about.rstrip('.')} (version {measured.version}).",
         cells=f"{len(scored)} of {len(scales)} cells",
         scored=", ".join(dict.fromkeys(cell.layout for cell in scored)) or "none",
