@@ -227,11 +227,23 @@ def plot_source_curves(curves: SourceCurves) -> Figure:
 def _mean_by_episode(histories: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return centres of blocks of episodes, and mean, 10th and 90th percentile of returns, each float64 (blocks,)."""
     length = min(map(len, histories))
-    starts = np.unique(np.geomspace(1, length + 1, _CURVE_PARTS + 1).round().astype(int))
-    sizes = np.diff(starts)
-    means = np.stack([np.add.reduceat(own[:length], starts[:-1] - 1) / sizes for own in histories])
+    episodes, means = average_in_blocks(np.stack([own[:length] for own in histories]))
     low, high = np.percentile(means, (10, 90), axis=0)
-    return np.sqrt(starts[:-1] * (starts[1:] - 1.0)), means.mean(axis=0), low, high
+    return episodes, means.mean(axis=0), low, high
+
+
+def average_in_blocks(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Average returns over blocks of episodes that are equally long on a logarithmic axis.
+
+    Args:
+        returns: returns by episode, float64 (N, E).
+
+    Returns:
+        The centres of the B blocks, at most 25, float64 (B,), and the means, float64 (N, B).
+    """
+    starts = np.unique(np.geomspace(1, returns.shape[1] + 1, _CURVE_PARTS + 1).round().astype(int))
+    means = np.add.reduceat(returns, starts[:-1] - 1, axis=1) / np.diff(starts)
+    return np.sqrt(starts[:-1] * (starts[1:] - 1.0)), means
 
 
 def plot_layouts(layouts: Sequence[Layout], titles: Sequence[str] | None = None) -> Figure:

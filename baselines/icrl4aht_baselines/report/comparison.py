@@ -46,7 +46,7 @@ from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_reference_returns
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.plotting import add_legend_below, axis_limits, save_figure
+from icrl4aht_data.plotting import add_legend_below, average_in_blocks, axis_limits, save_figure
 from icrl4aht_data.reading.arrow_tables import import_pyarrow
 from icrl4aht_data.utils.files import atomic_write, write_json
 from icrl4aht_data.utils.groups import grouped
@@ -438,7 +438,7 @@ def _format_range(values: Sequence[int], form: str) -> str:
 
 
 def plot_comparison(stored: StoredResults, path: Path) -> None:
-    """Plot the agents' return in each episode on a log axis, with dashed lines for cleared memory.
+    """Plot the agents' returns by episode on a log axis, with dashed lines for cleared memory.
 
     Each of the first six layouts with headroom has a panel. Horizontal lines show `stay` and best responses.
     """
@@ -457,7 +457,8 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
             for control, style in (("", "-"), ("cleared", "--")):
                 if (curve := curves.get((agent, control, layout))) is not None:
                     label = agent if not control else f"{agent}, memory cleared"
-                    axes.plot(np.arange(1, len(curve) + 1), curve, style, color=color, linewidth=1.2, label=label)
+                    episodes, (mean,) = average_in_blocks(curve[None])
+                    axes.plot(episodes, mean, style, color=color, linewidth=1.2, label=label)
         stays = [egos["stay"] for cell, egos in headroom.items() if cell[0] == layout]
         axes.axhline(np.mean(stays), color="gray", linestyle=":", label="stay")
         if (best := mean_best_return(layout, scales)) is not None:
