@@ -82,12 +82,12 @@ def bundled_tasks(split: str, kind: Literal["", "diverse"] = "") -> list[Task]:
 
 
 def paper_plan_sizes() -> tuple[float, ...]:
-    """Return profile `paper`'s numbers of learners, environment steps, recorded transitions and kept transitions."""
+    """Return profile `paper`'s numbers of tasks, environment steps and kept transitions."""
     profile = load_profile("paper")
     ego, count = profile.ego, sum(profile.task_count(name, "ppo") for name in profile.layouts)
     steps = ego.episodes * KEPT_STEPS
     total = count * ego.updates * ego.steps_per_update
-    return count, total, count * ego.environments * steps, count * profile.keep * steps
+    return count, total, count * profile.keep * steps
 
 
 def range_over_layouts(count: Callable[[Layout], int]) -> tuple[int, int]:
@@ -213,7 +213,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/format", "stays on, 0 to {}", lambda: BUTTON_STEPS),
     (
         "docs/scale",
-        "tasks {} learners 640 environment steps {} recorded transitions {} kept transitions {}",
+        "tasks {} environment steps {} kept transitions {}",
         paper_plan_sizes,
     ),
     ("docs/choices", "{} rearranged versions", lambda: reference.TRACK_PLAY["layout"]["rearranged"]),

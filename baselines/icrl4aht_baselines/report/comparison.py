@@ -221,8 +221,8 @@ def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
 
 def render_comparison(stored: StoredResults) -> str:
     """Return the text of docs/results.md. Tables leave out agents of older code, see `AgentFacts.commit`."""
-    scales, every = cell_scales(SUBMITTED_PROTOCOL), stored.returns()
-    results = {agent: cells for agent, cells in every.items() if not stored.agents[agent].commit}
+    scales = cell_scales(SUBMITTED_PROTOCOL)
+    results = {agent: cells for agent, cells in stored.returns().items() if not stored.agents[agent].commit}
     measured, scored = read_best_responses(), cells_with_headroom(scales)
     shown = stored.with_other_play_modes(results)
     effects = secondary_effects(stored, results, scales)
@@ -237,7 +237,6 @@ def render_comparison(stored: StoredResults) -> str:
         adaptation=published_adaptation_table({name: mean_best_return(name, scales) for name in TEST_LAYOUTS}),
         trainings=describe_training_runs(),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
-        earlier=", ".join(f"`{agent}`" for agent in every if agent not in results) or "none",
         measured=f"{measured.about.rstrip('.')} (version {measured.version}).",
         cells=f"{len(scored)} of {len(scales)} cells",
         scored=", ".join(dict.fromkeys(cell.layout for cell in scored)) or "none",
@@ -426,7 +425,7 @@ def describe_training_runs() -> str:
     models = sum(not one.agent.startswith("best response") for one in behaviours)
     runs = _format_range([len(one.seeds) for one in behaviours], "d")
     return (
-        f"For each of {len(behaviours)} behaviours (different teammates) a best response was trained in {runs} "
+        f"For each of {len(behaviours)} behaviours a best response was trained in {runs} "
         f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. For {models} of them stored models "
         f"earn more in most seeds."
     )

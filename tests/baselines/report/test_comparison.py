@@ -134,9 +134,9 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
     paths = comparison.write_comparison(some, tmp_path / "page")
     assert [path.name for path in paths] == [*comparison.RESULTS_FILES]
     text = paths[0].read_text(encoding="utf-8")
-    assert f"Other layouts were not measured.\n\n{published_adaptation_table({})}\n" in text
+    assert f"no ego can raise the return.\n\n{published_adaptation_table({})}\n" in text
     assert "| `high` | noise | oracle | 10 updates, 2 core-hours | – |" in text and "| `low`" not in text
-    assert "These models were trained with earlier code: `low`." in text and "None measured (version" in text
+    assert "`low`" not in text and "None measured (version" in text
     assert paths[1].stat().st_size > 10_000
     assert len(pd.read_parquet(paths[3])) == len(stored.table)
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: responses_folder / "measured.json")
