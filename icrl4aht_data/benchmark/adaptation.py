@@ -91,5 +91,5 @@ def published_adaptation_table(best: Mapping[str, float | None]) -> str:
         texts = ["–", "–"] if known is None else [f"{known:z.1f}", f"{known - episodic:+z.1f}"]
         steps = f"{len(entry['returns']['informed'])} x {entry['steps']:,}"
         rows.append([layout, texts[0], f"{informed:z.1f}", f"{episodic:z.1f}", texts[1], headroom_text(entry), steps])
-    header = ["layout", "B", *EGO_KINDS, "B - episodic", "informed - episodic", "seeds x steps"]
+    header = ["layout", "B", *EGO_KINDS, "B - episodic", "informed - episodic", "runs x steps"]
     return markdown_table(header, rows, right=6)

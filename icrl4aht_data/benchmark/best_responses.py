@@ -54,7 +54,7 @@ class BestResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         tasks: ids of the tasks whose teammates show this behaviour.
         seeds: training runs of egos with a teammate of this behaviour.
         best: mean return of the best ego that sees only its own observations; the ego is chosen by other episodes.
-        agent: name of the ego that is the best in all episodes, such as "best response, seed 1".
+        agent: name of the ego with the highest mean return over all seeds, such as "best response, seed 1".
     """
 
     layout: str

@@ -48,8 +48,8 @@ def test_only_all_test_tasks_of_a_layout_count_as_measured():
 def test_card_states_the_difference_on_each_measured_layout():
     content = card_facts(MINI)
     assert content["adaptation"] == {"demo_wide": "-2.0 (-3.0 to -1.0)"}
-    assert "if no interval follows): demo_wide -2.0 (-3.0 to -1.0).\n" in render_card(content)
-    assert "if no interval follows" not in render_card(content | {"adaptation": {}})
+    assert "over training runs): demo_wide -2.0 (-3.0 to -1.0).\n" in render_card(content)
+    assert "over training runs): " not in render_card(content | {"adaptation": {}})
 
 
 def test_without_a_file_nothing_is_measured(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves
+from icrl4aht_data.plotting import SourceCurves, add_curve, average_in_blocks, plot_source_curves
 
 
 def test_panel_of_a_source_shows_means_by_layout_and_split():
@@ -29,3 +29,13 @@ def test_panel_of_a_source_shows_means_by_layout_and_split():
     # Each drawn point is the mean of a block of episodes, and the blocks cover all episodes.
     assert first[-1, 1] > 800
     assert np.all(np.diff(first[:, 1]) > 0)
+
+
+def test_blocks_of_episodes_are_averaged_and_equally_long_on_a_log_axis():
+    returns = np.stack([np.arange(1.0, 101.0), np.ones(100)])
+    episodes, means = average_in_blocks(returns)
+    assert episodes[0] == 1 and means[0, 0] == 1 and len(episodes) == means.shape[1] <= 25
+    np.testing.assert_allclose(means[0], episodes, rtol=0.02)  # the mean episode is close to the centre
+    assert (means[1] == 1).all()
+    ratios = episodes[1:] / episodes[:-1]
+    assert ratios[-8:].max() < 1.1 * ratios[-8:].min(), "later blocks grow by a constant factor"

@@ -131,6 +131,7 @@ def bundled_release_size() -> tuple[int, ...]:
 def adaptation_on_demo_wide() -> tuple[float, ...]:
     """Return the returns of the informed and the episodic ego on demo_wide."""
     returns = published_adaptation()["demo_wide"]["returns"]
+    assert all(len(returns[kind]) == 3 for kind in EGO_KINDS), "three training runs of each"
     return tuple(fmean(returns[kind].values()) for kind in EGO_KINDS)
 
 
@@ -138,6 +139,7 @@ def adaptation_headroom() -> tuple[float, ...]:
     """Return the least and the greatest headroom of published layouts, their number, and that of `preference`."""
     found, (preference,) = published_adaptation().values(), read_adaptation(ROOT / "cards")[:1]
     assert preference["tasks"] == "preference-test-all"
+    assert all(low < 0 < high for low, high in (entry["interval"] for entry in found)), "intervals that contain 0"
     differences = [float(headroom_text(entry).split()[0]) for entry in (*found, preference)]
     return min(differences[:-1]), max(differences[:-1]), len(found), differences[-1]
 

@@ -168,11 +168,12 @@ def best_response_command(
 ) -> _Queued:
     """Train a best response to each teammate.
 
-    Trains an ego with the benchmark's observations by PPO, with one teammate. In the first half of the steps, the ego
-    also imitates the oracle. Teammates that behave the same share one best response. Tasks in which the oracle earns no
-    more than `stay` are left out. The best training run is chosen on other episodes than the reported ones. A stored
-    model that earns more replaces the trained best response. Writes OUT/best_responses.json and prints a table.
-    Finished runs are reused, and stopped runs resume. Give more --steps if the return still rises in the last quarter.
+    Trains an ego with the benchmark's observations by PPO, with one teammate. In the first half of the steps, the
+    ego also imitates the oracle. Teammates that behave the same share one best response. Tasks in which the oracle
+    earns no more than `stay` are left out. The best training run is chosen on other episodes than the reported
+    ones. For each reported seed, a stored model that earns more with the other seeds is used instead. Writes
+    OUT/best_responses.json and prints a table. Finished runs are reused, and stopped runs resume. Give more --steps
+    if the return still rises in the last quarter.
     """
     from icrl4aht_baselines.online.responses import (
         ResponseJob,

@@ -259,7 +259,7 @@ def secondary_effects(
 ) -> dict[tuple[str, ...], SecondaryEffect]:
     """Return all effects that the page tests besides the primary endpoint, see `SecondaryEffects`.
 
-    Agents are compared with the agent that has the next lower N on the track, paired by task and seed.
+    Agents are compared with the agent that has the next lower N on the track, paired by task, seed and training run.
     """
     found = {}
     for track in TRACKS:
@@ -426,8 +426,8 @@ def describe_training_runs() -> str:
     runs = _format_range([len(one.seeds) for one in behaviours], "d")
     return (
         f"For each of {len(behaviours)} behaviours a best response was trained in {runs} "
-        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. For {models} of them stored models "
-        f"earn more in most seeds."
+        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. For {models} of them a stored "
+        f"model earns more."
     )
 
 

@@ -204,8 +204,9 @@ def find_score(returns: AgentReturns, cells: Sequence[ResultCell], scales: CellS
             own = [number for number, other in enumerate(names) if other == name]
             if spans[own].mean() >= LEAST_HEADROOM:
                 of_cell.append(float(gains[:, own].mean() / spans[own].mean()))
-        values.append(np.array(of_cell))
-        labels.append(f"{cell.layout} {cell.family}")
+        if of_cell:
+            values.append(np.array(of_cell))
+            labels.append(f"{cell.layout} {cell.family}")
     worst, label = min((of_cell.min(), label) for of_cell, label in zip(values, labels, strict=True))
     return Score(
         total=ratio_interval([*groups.values()]),

@@ -1,7 +1,7 @@
 """Estimate the cost of generating a release: counts of steps and bytes, and hours.
 
-Bytes of scripted histories are within 10 % of profile `bundle` and `teach`, and hours within 30 % of profile `teach`.
-Hours of training are within a factor of about 2.
+If scripts play, bytes were right within 10 % (profiles `bundle` and `teach`), and hours within 30 % (profile `teach` on
+two cores, `devices` = 2). Hours of training are right within a factor of about 2.
 
 The network takes most of the time, so its forward pass is measured on this machine. The number of forward passes per
 update follows from the hyper-parameters. Stored numbers give the speed of the environment and the time to compile.

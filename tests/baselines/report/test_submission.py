@@ -149,7 +149,7 @@ def test_results_with_sampled_actions_are_added_to_an_agent(tmp_path):
     assert len(later.table) == 2 * len(stored.table) and later.agents == {"mine": FACTS}
     shown = later.with_other_play_modes(later.returns())
     assert list(shown) == ["mine", "mine (sampled)"]
-    table = comparison.agents_table(later, shown, {})
+    table = comparison.agents_table(later, shown, {}, {})
     assert "| `mine` | none | none | – | – | – |" in table and "| `mine (sampled)` |  |  |  | – |" in table
     page = comparison.render_comparison(later)
     assert "Not measured for" not in page and "Not measured for: `mine`." in comparison.render_comparison(stored)
