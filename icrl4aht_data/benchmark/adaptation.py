@@ -35,7 +35,10 @@ def task_set_name(track: str, split: str, layout: str, families: Iterable[str] =
 
 
 def published_adaptation() -> dict[str, dict[str, Any]]:
-    """Return the stored entry of each published layout whose test tasks were all measured, by layout name."""
+    """Return the stored measurements of published layouts, by name of the layout.
+
+    A layout is left out if some of its test tasks were not measured.
+    """
     entries = {entry["tasks"]: entry for entry in read_adaptation(card_file(ADAPTATION).parent)}
     names = {layout: task_set_name(track, "test", layout) for track, of in TRACKS.items() for layout in of["test"]}
     found = {layout: entries[name] for layout, name in names.items() if name in entries}

@@ -1,8 +1,8 @@
 """Best responses: for each teammate, the highest known return of an ego that sees only its own observations.
 
-The file `cards/best_responses.json` stores the best responses. Each is the return of a recurrent ego trained with one
-teammate, or of stored models that earn more in other episodes. Tasks whose teammates behave the same share a best
-response.
+The file `cards/best_responses.json` stores the best responses. A best response is a recurrent ego that was trained with
+one teammate, or a model of the page of results that earned more than this ego in the episodes used to choose between
+them. Tasks whose teammates behave the same share a best response.
 """
 
 from __future__ import annotations

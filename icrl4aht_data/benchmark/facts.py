@@ -27,7 +27,7 @@ TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
 """Short layout names of each track and split: track -> split -> layouts (paper, App. A)."""
 
 SPREAD_SEED = 4
-"""base_seed of spread teammates (`icrl4aht_generation.teammates.spread`), whose behaviours are numbered separately."""
+"""Value of `base_seed` in the entries of spread teammates, see `icrl4aht_generation.teammates.spread`."""
 
 PREFERENCE = "preference"
 """Track of this project, not of the paper: all episodes of a task want the same dish, but no observation shows which

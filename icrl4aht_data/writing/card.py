@@ -326,7 +326,8 @@ def _teammate_rows(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[
 def _behaviour_counts(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Count teammates with known behaviour and distinct behaviours by split, and behaviours that both splits share.
 
-    Spread teammates, which all differ from each other, are not compared with drawn ones.
+    The behaviours of spread teammates, which all differ from each other, and of drawn teammates are numbered
+    separately, so a spread and a drawn teammate always count as different.
     """
     known = [row for row in teammates if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None]
     found = {

@@ -289,8 +289,9 @@ def include_models(found: BestResponse, models: Mapping[str, Mapping[str, np.nda
 
     The return of an ego that is chosen by the reported episodes would be too high. Therefore an ego is chosen for each
     seed of `REPORT_SEEDS` separately: the model with the highest mean return with the other seeds, or the trained ego
-    if its return with `CHOICE_SEEDS` is as high. Field `best` of the result is the mean return of these egos. Field
-    `agent` is the ego that would be chosen by all seeds.
+    if its return with `CHOICE_SEEDS` is as high. Field `best` of the result is the mean return of the chosen egos; the
+    trained ego counts with its mean over all seeds, because its returns by seed are not stored. Field `agent` is the
+    ego that would be chosen by all seeds.
 
     Args:
         found: best response; its training runs are used, and its fields `best` and `agent` are replaced.

@@ -57,7 +57,7 @@ def test_teammates_that_share_a_history_are_held_out_together(swap_release, lite
 
 @pytest.mark.parametrize("kind", ["lite", "full", "published"])
 def test_conversions_keep_changes_of_teammates(swap_release, tmp_path, kind):
-    """A converted history keeps its second teammate, whose task is not part of the new release."""
+    """The teammate changes in the converted history; the new release has no task with the second teammate."""
     part, copy = load_icrl4aht(swap_release).select([1]), tmp_path / "copy"
     if kind == "published":
         to_published(part, tmp_path / "published")
