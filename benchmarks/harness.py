@@ -1,4 +1,4 @@
-"""Helpers of the benchmarks: JSON lines, comparisons with a peer in rounds, and FLOP counts.
+"""Helpers for the benchmarks: JSON lines, comparisons with other implementations, and FLOP counts.
 
 Compared implementations take turns in rounds, so that the load of the machine is similar for all of them. A reported
 ratio is the median over rounds of the ratio within a round.

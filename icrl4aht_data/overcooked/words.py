@@ -101,11 +101,11 @@ class CellWords:
             self._window_position[(*here, slice(layout.cells))] = layout.window_position
 
     def ids(self, record: Array, layout_number: Array | None = None, agent: int = 0) -> Array:
-        """Return the words of the 25 cells that one agent sees.
+        """Return the number of the word of each of the 25 cells that one agent sees.
 
         Args:
             record: uint8 (B, S), state records; for several layouts, shorter records are padded at the end.
-            layout_number: int, index of each record's layout in `layouts`, with the shape of the first axes of B; None
+            layout_number: int, index of each record's layout in `layouts`; its shape is B or the first axes of B. None
                 if there is one layout.
             agent: 0 (ego) or 1 (teammate).
 

@@ -1,4 +1,4 @@
-"""Commands that record a model's histories, make reference models, and compare results on the page of results."""
+"""Commands that record a model's histories, train reference models, and write the page of results."""
 
 from __future__ import annotations
 

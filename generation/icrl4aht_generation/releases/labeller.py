@@ -117,7 +117,7 @@ def choose_checkpoint(returns: np.ndarray) -> int:
     Args:
         returns: (C, E), greedy returns of C checkpoints in the same E episodes.
     """
-    differences = returns - returns[-1]  # paired differences, because all checkpoints play the same episodes
+    differences = returns - returns[-1]  # paired, because all checkpoints play episodes with the same seeds
     means = differences.mean(axis=1)
     errors = differences.std(axis=1, ddof=1) / np.sqrt(returns.shape[1])
     clearly = (means >= _LEAST_GAIN) & (means > _STANDARD_ERRORS * errors)
