@@ -12,15 +12,21 @@ from statistics import fmean
 from typing import Any
 
 from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.text import card_file, markdown_table
 
 EGO_KINDS = ("informed", "episodic")
 
+SCRIPTS = (*REFERENCES, "search")
+"""Reference egos that are measured on the same tasks. On published layouts they are not, because `cards/headroom.json`
+has their returns."""
+
 _LAYOUT_TASKS = 20  # number of test tasks on each published layout
 
 ADAPTATION = "adaptation.json"
-"""Name of the file of measured returns, in a folder of training runs and among the package's cards."""
+"""Name of the file of measured returns, in a folder of training runs and among the package's cards. A Markdown file
+beside it has the same returns as a table."""
 
 
 def read_adaptation(folder: Path) -> list[dict[str, Any]]:
@@ -61,21 +67,29 @@ def headroom_text(entry: Mapping[str, Any]) -> str:
 
 
 def adaptation_table(entries: Iterable[Mapping[str, Any]], layouts: bool = True) -> str:
-    """Return a Markdown table of measured sets of tasks: the return of each kind of ego, and the difference.
+    """Return a Markdown table of measured sets of tasks: mean returns of egos and scripts, and the difference.
+
+    Columns of scripts are left out if no set has their returns.
 
     Args:
         entries: entries of a file `ADAPTATION`.
         layouts: whether a set of several layouts also gets a row for each layout.
     """
-    rows = []
+    entries, rows = list(entries), []
+    scripts = [name for name in SCRIPTS if any("scripts" in entry for entry in entries)]
+
+    def texts(returns: Mapping[str, float], names: Iterable[str]) -> list[str]:
+        return [f"{returns[name]:z.1f}" if name in returns else "" for name in names]
+
     for entry in entries:
-        means = [f"{mean:z.1f}" for mean in _mean_returns(entry)]
+        means = [*texts(entry.get("scripts", {}), scripts), *(f"{mean:z.1f}" for mean in _mean_returns(entry))]
         training = [str(len(entry["returns"]["informed"])), f"{entry['steps']:,}", str(entry["width"])]
         rows.append([entry["tasks"], str(entry["number"]), *means, headroom_text(entry), *training])
         for layout, of in entry["layouts"].items() if layouts and len(entry["layouts"]) > 1 else ():
-            one, other = (of[kind] for kind in EGO_KINDS)
-            rows.append([layout, "", f"{one:z.1f}", f"{other:z.1f}", f"{one - other:+z.1f}", "", "", ""])
-    return markdown_table(["set", "tasks", *EGO_KINDS, "difference", "seeds", "steps of each", "width"], rows, right=7)
+            difference = f"{of['informed'] - of['episodic']:+z.1f}"
+            rows.append([layout, "", *texts(of, (*scripts, *EGO_KINDS)), difference, "", "", ""])
+    header = ["set", "tasks", *scripts, *EGO_KINDS, "difference", "seeds", "steps of each", "width"]
+    return markdown_table(header, rows, right=len(header) - 1)
 
 
 def published_adaptation_table(best: Mapping[str, float | None]) -> str:

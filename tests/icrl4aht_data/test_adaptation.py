@@ -71,3 +71,19 @@ def test_table_has_a_row_for_each_layout_of_a_set():
         "| demo_wide |  | 3.0 | 1.0 | +2.0 |  |  |  |",
         "| test_wide |  | 0.0 | 0.5 | -0.5 |  |  |  |",
     ]
+
+
+def test_table_shows_returns_of_scripts_beside_those_of_egos():
+    """Sets without returns of scripts have empty cells, as on published layouts."""
+    scripts = {"stay": 0.0, "random": -1.0, "oracle": 40.0, "search": 30.0}
+    both = make_entry("all", 3.0, 1.0) | {"scripts": scripts}
+    both["layouts"]["demo_wide"] |= scripts
+    both["layouts"]["test_wide"] = {"informed": 0.0, "episodic": 0.5, **scripts}
+    header, _, *rows = adaptation_table([both, ENTRY]).splitlines()
+    assert header.startswith("| set | tasks | stay | random | oracle | search | informed | episodic | difference |")
+    assert rows == [
+        "| all | 20 | 0.0 | -1.0 | 40.0 | 30.0 | 3.0 | 1.0 | +2.0 | 1 | 8,000 | 64 |",
+        "| demo_wide |  | 0.0 | -1.0 | 40.0 | 30.0 | 3.0 | 1.0 | +2.0 |  |  |  |",
+        "| test_wide |  | 0.0 | -1.0 | 40.0 | 30.0 | 0.0 | 0.5 | -0.5 |  |  |  |",
+        "| teammate-test-demo_wide | 20 |  |  |  |  | 10.0 | 12.0 | -2.0 (-3.0 to -1.0) | 1 | 8,000 | 64 |",
+    ]

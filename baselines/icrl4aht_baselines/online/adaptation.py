@@ -3,7 +3,7 @@
 Two recurrent egos are trained on the same tasks with the same budget, and both have their memory cleared before each
 episode. They are the informed and the episodic ego of `icrl4aht_data.benchmark.adaptation`. Their difference estimates
 how much memory across episodes can raise the return. It is an estimate, because longer training would raise both
-returns.
+returns. On the track `preference`, reference egos also play the tasks.
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.teammates.registry import build_teammate, with_equal_parameter_names
 from scipy import stats
 
-from icrl4aht_baselines.online.responses import EgoJob
+from icrl4aht_baselines.agents.egos import find_agent
+from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.online.responses import PROTOCOL, EgoJob
 from icrl4aht_baselines.online.rl2 import PlayTask
 from icrl4aht_baselines.training.options import ResponseOptions
-from icrl4aht_data.benchmark.adaptation import ADAPTATION, EGO_KINDS, read_adaptation
-from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.benchmark.adaptation import ADAPTATION, EGO_KINDS, SCRIPTS, adaptation_table, read_adaptation
+from icrl4aht_data.benchmark.facts import PREFERENCE
+from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, write_json
 from icrl4aht_data.utils.groups import grouped
@@ -35,11 +38,11 @@ _MEASURE_SEED = 1_000
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptationJob(EgoJob):
-    """Job that trains an informed or episodic ego on a set of tasks, and measures its returns.
+    """Job that trains an informed or episodic ego on a set of tasks, or takes a script, and measures its returns.
 
     Attributes:
         title: name of the set of tasks.
-        kind: kind of the ego, "informed" or "episodic".
+        kind: kind of the ego, "informed" or "episodic", or one of `SCRIPTS`.
 
     Raises:
         OptionError: if the set has more tasks than are played in parallel.
@@ -71,8 +74,25 @@ class AdaptationJob(EgoJob):
         tasks = json_hash([task.task_id for task in self.tasks])
         return {"tasks_hash": tasks, "kind": self.kind, **super().settings}
 
+    @property
+    def is_quick(self) -> bool:
+        """Whether the job takes only seconds: scripts are not trained."""
+        return self.kind in SCRIPTS
+
+    @property
+    def updates(self) -> int:
+        """Number of training steps; 1 for a script."""
+        return 1 if self.kind in SCRIPTS else super().updates
+
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
-        """Train the ego. Return {"returns": task id -> mean return in new episodes with sampled actions}."""
+        """Train the ego if it is no script. Return {"returns": task id -> mean return in new episodes}.
+
+        A trained ego samples its actions.
+        """
+        if self.kind in SCRIPTS:
+            ego = find_agent(self.kind).make
+            results = evaluate(self.kind, ego, self.tasks, PROTOCOL, seeds=(self.seed,), played=lambda count: None)
+            return {"returns": {one.task_id: round(float(np.mean(one.returns)), 3) for one in results}}
         trainer, params = self.train(self._parallel_tasks(), on_update)
         returns = trainer.measure(params, MEASURED_EPISODES, _MEASURE_SEED).mean(axis=1)
         ids = np.array([task.id for task in trainer.tasks])
@@ -91,15 +111,37 @@ class AdaptationJob(EgoJob):
         return [different[played % len(different)] for played in range(self.options.tasks)]
 
 
+def cross_dishes(tasks: Sequence[Task]) -> list[Task]:
+    """Return tasks in which each teammate on a layout wants each dish that one of the layout's tasks has.
+
+    In the tasks of the track `preference` a teammate wants a single dish. An ego that is trained on few such tasks can
+    tell the dish from how the teammate moves, which does not help with other teammates.
+    """
+    crossed = []
+    for own in grouped(tasks, lambda task: task.layout_name).values():
+        different = {json_hash(task.teammate): task for task in own}
+        dishes = dict.fromkeys(task.recipes for task in own)
+        crossed += [
+            make_task(task.track, task.split, task.layout_name, task.teammate, task.seed, dish)
+            for task in different.values()
+            for dish in dishes
+        ]
+    return crossed
+
+
 def adaptation_jobs(
     sets: Mapping[str, Sequence[Task]], seeds: int, options: ResponseOptions, out: Path
 ) -> list[AdaptationJob]:
-    """Return a job for each seed, set of tasks (name -> tasks) and kind of ego, in this order."""
+    """Return a job for each seed, set of tasks (name -> tasks) and kind of ego, in this order.
+
+    Tasks of the track `preference` are replaced by those that `cross_dishes` returns, and scripts play them with seed 0.
+    """
+    own = {title: cross_dishes(of) if of[0].track == PREFERENCE else of for title, of in sets.items()}
     return [
         AdaptationJob(tuple(tasks), seed, options, out, title=title, kind=kind)
         for seed in range(seeds)
-        for title, tasks in sets.items()
-        for kind in EGO_KINDS
+        for title, tasks in own.items()
+        for kind in (*EGO_KINDS, *(SCRIPTS if not seed and tasks[0].track == PREFERENCE else ()))
     ]
 
 
@@ -108,7 +150,8 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
 
     An entry has the training steps, the width of the network, the mean return of each kind of ego for each seed,
     and the mean return on each layout over these seeds. If there are several seeds, "interval" is a 95 % Student's t
-    interval over the seeds of the difference between the two kinds.
+    interval over the seeds of the difference between the two kinds. If all scripts have played the tasks, "scripts" has
+    their mean returns, and each layout has them as well.
     """
     own = [job for job in jobs if job.title == title and job.is_finished()]
     seeds = sorted(set.intersection(*({job.seed for job in own if job.kind == kind} for kind in EGO_KINDS)))
@@ -116,6 +159,7 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
         return None
     found = {(job.kind, job.seed): job.result()["returns"] for job in own}
     layouts = dict.fromkeys(task.layout.name for task in own[0].tasks)
+    scripts = SCRIPTS if all((name, 0) in found for name in SCRIPTS) else ()
 
     def mean(kind: str, seeds: Sequence[int], layout: str = "") -> float:
         ids = [task.task_id for task in own[0].tasks if layout in ("", task.layout.name)]
@@ -128,6 +172,7 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
         differences = informed - episodic
         half = stats.t.ppf(0.975, len(seeds) - 1) * stats.sem(differences)
         interval = [round(float(differences.mean() + side * half), 3) for side in (-1, 1)]
+    played = dict.fromkeys(EGO_KINDS, seeds) | {name: [0] for name in scripts}
     return {
         "tasks": title,
         "number": len(own[0].tasks),
@@ -135,14 +180,16 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
         "width": own[0].options.width,
         "returns": returns,
         "interval": interval,
-        "layouts": {layout: {kind: mean(kind, seeds, layout) for kind in EGO_KINDS} for layout in layouts},
+        **({"scripts": {name: mean(name, [0]) for name in scripts}} if scripts else {}),
+        "layouts": {layout: {kind: mean(kind, of, layout) for kind, of in played.items()} for layout in layouts},
     }
 
 
 def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
     """Add the measurements of finished jobs to a folder's file `ADAPTATION`. Return the file's path.
 
-    The entry of a set of tasks is replaced, unless the stored entry has more seeds.
+    The entry of a set of tasks is replaced, unless the stored entry has more seeds. The table of all entries is written
+    beside it.
     """
     path = folder / ADAPTATION
     known = {entry["tasks"]: entry for entry in read_adaptation(folder)}
@@ -152,4 +199,6 @@ def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
             known[title] = entry
     with atomic_write(path) as partial:
         write_json(partial, list(known.values()))
+    with atomic_write(path.with_suffix(".md")) as partial:
+        partial.write_text(f"# Adaptation headroom\n\n{adaptation_table(known.values())}\n", encoding="utf-8")
     return path

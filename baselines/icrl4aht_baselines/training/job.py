@@ -22,14 +22,18 @@ class TrainingJob(ABC):
         options: settings with the attributes `training`, a function from the seed to the settings of the trainer, and
             `steps_per_update`; not needed if a class overrides the properties of these names.
         out: folder of all jobs.
-        xla_threads, is_quick: see `Job`.
+        xla_threads: see `Job`.
     """
 
     seed: int
     options: Any
     out: Path
     xla_threads: int | None = 1
-    is_quick: bool = False
+
+    @property
+    def is_quick(self) -> bool:
+        """See `Job.is_quick`."""
+        return False
 
     @property
     @abstractmethod

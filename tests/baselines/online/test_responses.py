@@ -13,12 +13,12 @@ import pytest
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.protocols import test_tasks as tasks_of
 from icrl4aht_baselines.online import adaptation, responses
-from icrl4aht_baselines.online.adaptation import AdaptationJob, adaptation_jobs, write_adaptation
+from icrl4aht_baselines.online.adaptation import AdaptationJob, adaptation_entry, adaptation_jobs, write_adaptation
 from icrl4aht_baselines.online.responses import ResponseJob, ResponseOptions
 from icrl4aht_baselines.training import trainer
 from icrl4aht_generation.teammates.distances import common_records
 
-from icrl4aht_data.benchmark.adaptation import adaptation_table, read_adaptation
+from icrl4aht_data.benchmark.adaptation import EGO_KINDS, SCRIPTS, adaptation_table, read_adaptation
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.errors import OptionError
@@ -112,9 +112,36 @@ def test_headroom_table_shows_mean_difference_and_interval(tmp_path):
     assert read_adaptation(tmp_path) == [entry], "no job of the other set is finished"
 
 
-def test_headroom_table_in_the_docs_matches_stored_results():
+@pytest.mark.slow
+def test_scripts_play_the_tasks_of_track_preference(tmp_path, monkeypatch):
+    """Scripts are measured once for all training seeds; `stay` earns nothing where its teammate cannot deliver."""
+    monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded", 2))
+    tasks = tasks_of(PREFERENCE, "rooms-0-46")[:2]
+    jobs = adaptation_jobs({"few": tasks}, 2, TINY, tmp_path)
+    assert [job.kind for job in jobs] == [*EGO_KINDS, *SCRIPTS, *EGO_KINDS]
+    for job in jobs:
+        if job.kind in SCRIPTS:
+            assert job.updates == 1
+            job.run()
+    earned = {job.kind: job.result()["returns"] for job in jobs if job.is_finished()}
+    assert all(returns.keys() == {task.task_id for task in tasks} for returns in earned.values())
+    means = {kind: np.mean(list(returns.values())) for kind, returns in earned.items()}
+    assert means["oracle"] > means["search"], means
+    assert means["oracle"] > means["stay"], means
+    assert not adaptation_entry("few", jobs), "no trained ego is finished"
+    for job in jobs[:2]:
+        (tmp_path / job.name).mkdir()
+        content = {"settings": job.settings, "returns": {task.task_id: 1.0 for task in tasks}}
+        (tmp_path / job.name / "result.json").write_text(json.dumps(content))
+    entry = adaptation_entry("few", jobs)
+    assert entry["scripts"] == {kind: round(mean, 3) for kind, mean in means.items()}
+    assert entry["layouts"] == {"rooms-0-46": {"informed": 1.0, "episodic": 1.0, **entry["scripts"]}}
+
+
+def test_headroom_tables_in_cards_and_docs_match_stored_results():
     page = (ROOT / "docs" / "preference.md").read_text(encoding="utf-8")
     entries = read_adaptation(card_file("adaptation.json").parent)
+    assert adaptation_table(entries) in card_file("adaptation.md").read_text(encoding="utf-8")
     assert adaptation_table([one for one in entries if one["tasks"].startswith(PREFERENCE)], layouts=False) in page
 
 
