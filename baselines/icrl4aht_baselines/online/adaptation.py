@@ -134,7 +134,7 @@ def adaptation_jobs(
 ) -> list[AdaptationJob]:
     """Return a job for each seed, set of tasks (name -> tasks) and kind of ego, in this order.
 
-    Tasks of the track `preference` are replaced by those that `cross_dishes` returns, and scripts play them with seed 0.
+    Tasks of the track `preference` are replaced by those of `cross_dishes`, and scripts play them with seed 0.
     """
     own = {title: cross_dishes(of) if of[0].track == PREFERENCE else of for title, of in sets.items()}
     return [

@@ -117,5 +117,6 @@ class TrainingJob(ABC):
             if self.is_finished():
                 return
             content = {"settings": self.settings, **self.measure(on_update)}
+            self.folder.mkdir(parents=True, exist_ok=True)  # only training makes the folder, and a job may need none
             with atomic_write(self.result_file) as partial:
                 write_json(partial, content)
