@@ -52,7 +52,7 @@ class AdaptationJob(EgoJob):
     kind: str
 
     def __post_init__(self) -> None:
-        if len(self.tasks) > self.options.tasks:
+        if self.kind in EGO_KINDS and len(self.tasks) > self.options.tasks:
             raise OptionError(
                 f"tasks = {self.options.tasks}: {self.title} has {len(self.tasks)} tasks, and all must be played; "
                 f"give --tasks {len(self.tasks)} or more"
@@ -132,17 +132,20 @@ def cross_dishes(tasks: Sequence[Task]) -> list[Task]:
 def adaptation_jobs(
     sets: Mapping[str, Sequence[Task]], seeds: int, options: ResponseOptions, out: Path
 ) -> list[AdaptationJob]:
-    """Return a job for each seed, set of tasks (name -> tasks) and kind of ego, in this order.
+    """Return a job for each seed, set of tasks (name -> tasks) and kind of ego, in this order, and those of scripts.
 
-    Tasks of the track `preference` are replaced by those of `cross_dishes`, and scripts play them with seed 0.
+    Tasks of the track `preference` are replaced by those of `cross_dishes`. Each script plays them all in one job, with
+    seed 0, because a script's program is compiled for the layouts that it plays.
     """
     own = {title: cross_dishes(of) if of[0].track == PREFERENCE else of for title, of in sets.items()}
+    scripted = tuple(task for tasks in own.values() for task in tasks if task.track == PREFERENCE)
+    scripts = [AdaptationJob(scripted, 0, options, out, title=PREFERENCE, kind=kind) for kind in SCRIPTS]
     return [
         AdaptationJob(tuple(tasks), seed, options, out, title=title, kind=kind)
         for seed in range(seeds)
         for title, tasks in own.items()
-        for kind in (*EGO_KINDS, *(SCRIPTS if not seed and tasks[0].track == PREFERENCE else ()))
-    ]
+        for kind in EGO_KINDS
+    ] + (scripts if scripted else [])
 
 
 def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any] | None:
@@ -153,13 +156,16 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
     interval over the seeds of the difference between the two kinds. If all scripts have played the tasks, "scripts" has
     their mean returns, and each layout has them as well.
     """
-    own = [job for job in jobs if job.title == title and job.is_finished()]
+    own = [job for job in jobs if job.title == title and job.kind in EGO_KINDS and job.is_finished()]
     seeds = sorted(set.intersection(*({job.seed for job in own if job.kind == kind} for kind in EGO_KINDS)))
     if not seeds:
         return None
     found = {(job.kind, job.seed): job.result()["returns"] for job in own}
+    scripts = {job.kind: job.result()["returns"] for job in jobs if job.kind in SCRIPTS and job.is_finished()}
+    if len(scripts) < len(SCRIPTS):
+        scripts = {}
+    found |= {(name, 0): returns for name, returns in scripts.items()}
     layouts = dict.fromkeys(task.layout.name for task in own[0].tasks)
-    scripts = SCRIPTS if all((name, 0) in found for name in SCRIPTS) else ()
 
     def mean(kind: str, seeds: Sequence[int], layout: str = "") -> float:
         ids = [task.task_id for task in own[0].tasks if layout in ("", task.layout.name)]
@@ -193,7 +199,7 @@ def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
     """
     path = folder / ADAPTATION
     known = {entry["tasks"]: entry for entry in read_adaptation(folder)}
-    for title in dict.fromkeys(job.title for job in jobs):
+    for title in dict.fromkeys(job.title for job in jobs if job.kind in EGO_KINDS):
         entry = adaptation_entry(title, jobs)
         if entry and len(known.get(title, entry)["returns"]["informed"]) <= len(entry["returns"]["informed"]):
             known[title] = entry
