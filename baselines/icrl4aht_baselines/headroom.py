@@ -15,7 +15,7 @@ from icrl4aht_baselines.online.responses import find_behaviours
 from icrl4aht_baselines.report.page import PAPER_METHODS, published_cells
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, evaluate_agent
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, SUBMITTED_SEEDS
-from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.facts import PREFERENCE, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
 from icrl4aht_data.utils.text import markdown_table
 
@@ -28,8 +28,9 @@ HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
 def measure_headroom(out: Path, protocols: Sequence[str]) -> list[EvaluationRun]:
     """Evaluate every reference ego under every protocol; results are stored in OUT/PROTOCOL/AGENT and reused.
 
-    The ego `stay` also plays the validation tasks, since scores are relative to its returns. Under the protocol of the
-    scores, egos play with the seeds of submitted results, under other protocols with seed 0.
+    The ego `stay` also plays validation tasks and, under the protocol of the scores, the test tasks of the track
+    `preference`, since scores are relative to its returns. Under this protocol, egos play with the seeds of submitted
+    results, under other protocols with seed 0.
 
     Args:
         out: folder of the results.
@@ -40,6 +41,7 @@ def measure_headroom(out: Path, protocols: Sequence[str]) -> list[EvaluationRun]
         seeds = SUBMITTED_SEEDS if protocol == SUBMITTED_PROTOCOL else (0,)
         splits = EVALUATION_SPLITS if agent == "stay" else ("test",)
         tasks = [task for split, track in product(splits, TRACKS) for task in bundled_tasks(track, split)]
+        tasks += bundled_tasks(PREFERENCE, "test") if agent == "stay" and protocol == SUBMITTED_PROTOCOL else []
         folder = out / protocol / agent
         runs.append(evaluate_agent(find_agent(agent), tasks, get_protocol(protocol), folder, seeds=seeds))
     return runs

@@ -2,7 +2,8 @@
 
 The file `cards/best_responses.json` stores the best responses. A best response is a recurrent ego that was trained with
 one teammate, or a model of the page of results that earned more than this ego in the episodes used to choose between
-them. Tasks whose teammates behave the same share a best response.
+them. On the track `preference` it is the informed ego of `icrl4aht_data.benchmark.adaptation`. Tasks whose teammates
+behave the same share a best response.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from icrl4aht_data.utils.text import card_file
 
 
 class TrainingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One training run of an ego with one teammate.
+    """One training run of an ego with one teammate, or of an informed ego.
 
     Attributes:
         seed: seed of the training run.
@@ -32,6 +33,8 @@ class TrainingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         acting: "greedy" or "sampled" actions, whichever earned more in the episodes of `choice`.
         slope: rise of the mean return from the third to the last quarter of the steps of the training run.
         init: name of the bundled model that the training run started from; empty for random parameters.
+        tasks: number of tasks of the training run. If there are several, the ego is an informed ego, see
+            `icrl4aht_data.benchmark.adaptation`.
     """
 
     seed: int
@@ -42,6 +45,7 @@ class TrainingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     acting: str = ""
     slope: float | None = None
     init: str = ""
+    tasks: int = 1
 
 
 class BestResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

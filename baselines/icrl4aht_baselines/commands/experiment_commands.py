@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from functools import partial, wraps
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -107,9 +107,10 @@ def control_command(out: Path) -> None:
 def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None:
     """Measure the reference egos on every test task.
 
-    The ego `stay` also plays the validation tasks, since scores are relative to its returns. Under protocol `seeded`,
-    each task is played with the seeds 0, 1 and 2. Writes all results into OUT, their summaries into OUT/headroom.json,
-    OUT/headroom.md and OUT/stay.json, and groups of test teammates that behave the same into OUT/behaviours.json.
+    Under protocol `seeded`, each task is played with the seeds 0, 1 and 2. The ego `stay` also plays the validation
+    tasks and, under `seeded`, the test tasks of track `preference`, since scores are relative to its returns. Writes
+    all results into OUT, their summaries into OUT/headroom.json, OUT/headroom.md and OUT/stay.json, and groups of test
+    teammates that behave the same into OUT/behaviours.json.
     """
     from icrl4aht_baselines.headroom import HEADROOM_FILES, find_equal_teammates, measure_headroom, write_headroom_cards
 
@@ -214,9 +215,11 @@ def adaptation_headroom_command(
     Trains two egos on the tasks of each layout. An informed ego observes the task's number in every step; an episodic
     ego has to identify the teammate in each episode. Prints the difference of their returns, with an interval over the
     seeds. The difference is an estimate, because both egos are trained for --steps only. Writes OUT/adaptation.json.
-    Finished training runs are reused, and stopped runs resume.
+    Finished training runs are reused, and stopped runs resume. On the track `preference` each teammate on a layout
+    wants each dish, scripts play the same tasks, and informed egos are added to OUT/best_responses.json.
     """
-    from icrl4aht_baselines.online.adaptation import adaptation_jobs, write_adaptation
+    from icrl4aht_baselines.online.adaptation import adaptation_jobs, informed_responses, write_adaptation
+    from icrl4aht_baselines.online.responses import add_responses
     from icrl4aht_data.benchmark.adaptation import adaptation_table, read_adaptation, task_set_name
 
     sets: dict[str, list[Task]] = defaultdict(list)
@@ -224,7 +227,13 @@ def adaptation_headroom_command(
         where = "all" if together else task.layout.name
         sets[task_set_name(task.track, task.split, where, choice["families"])].append(task)
     jobs = adaptation_jobs(sets, seeds, replace_options(ResponseOptions(_STEPS), training), out)
-    return jobs, partial(write_adaptation, jobs), lambda folder: adaptation_table(read_adaptation(folder))
+
+    def write(folder: Path) -> Path:
+        if found := informed_responses(jobs):
+            add_responses(found, folder, _model_returns())
+        return write_adaptation(jobs, folder)
+
+    return jobs, write, lambda folder: adaptation_table(read_adaptation(folder))
 
 
 @click.command(

@@ -8,6 +8,7 @@ returns. On the track `preference`, reference egos also play the tasks.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +21,12 @@ from scipy import stats
 
 from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.evaluator import evaluate
-from icrl4aht_baselines.online.responses import PROTOCOL, EgoJob
+from icrl4aht_baselines.evaluate.protocols import bundled_tasks
+from icrl4aht_baselines.online.responses import PROTOCOL, EgoJob, choose_best_response
 from icrl4aht_baselines.online.rl2 import PlayTask
 from icrl4aht_baselines.training.options import ResponseOptions
 from icrl4aht_data.benchmark.adaptation import ADAPTATION, EGO_KINDS, SCRIPTS, adaptation_table, read_adaptation
+from icrl4aht_data.benchmark.best_responses import BestResponse, TrainingRun
 from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import OptionError
@@ -208,3 +211,14 @@ def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
     with atomic_write(path.with_suffix(".md")) as partial:
         partial.write_text(f"# Adaptation headroom\n\n{adaptation_table(known.values())}\n", encoding="utf-8")
     return path
+
+
+def informed_responses(jobs: Sequence[AdaptationJob]) -> list[BestResponse]:
+    """Return the informed egos of finished jobs as best responses, one for each test task of the track `preference`."""
+    tasks = {task.task_id: task for task in bundled_tasks(PREFERENCE, "test")}
+    runs = defaultdict(list)
+    for job in (job for job in jobs if job.kind == "informed" and job.is_finished()):
+        steps, width = job.options.updates * job.options.steps_per_update, job.options.width
+        for task, earned in job.result()["returns"].items():
+            runs[task].append(TrainingRun(job.seed, steps, earned, width, acting="sampled", tasks=len(job.tasks)))
+    return [choose_best_response([task], runs[name]) for name, task in tasks.items() if name in runs]

@@ -63,9 +63,10 @@ ABOUT = (
     "memory cleared before each episode, and imitates the oracle in the first half of the training. Episodes of seed "
     f"{CHOICE_SEEDS[0]} decide which training run is used. Returns are means over the tasks and the seeds "
     f"{', '.join(map(str, REPORT_SEEDS))}. For each of these seeds, the stored model that earns most with the other "
-    f"two is used instead if it earns more with them than the training run with seed {CHOICE_SEEDS[0]}."
+    f"two is used instead if it earns more with them than the training run with seed {CHOICE_SEEDS[0]}. On the track "
+    "`preference`, best responses are informed egos, which are trained with all tasks of a layout and observe the "
+    "task's number."
 )
-
 
 PLAY = PlayOptions(task_end=1.0)
 """Play options of a best response: each task is one episode, because the ego trains with a single teammate."""
@@ -267,7 +268,7 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainingRun]
     is the mean return of this run in other episodes, with the seeds `REPORT_SEEDS`. Of several runs with the same seed,
     initial model, steps and width, only the last is used.
     """
-    task, seeds = tasks[0], {(one.init, one.steps, one.width, one.seed): one for one in trainings}
+    task, seeds = tasks[0], {(one.tasks, one.init, one.steps, one.width, one.seed): one for one in trainings}
     best = best_training_run(seeds.values())
     return BestResponse(
         layout=task.layout.name,
@@ -281,7 +282,8 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainingRun]
 
 
 def _ego_name(run: TrainingRun) -> str:
-    return f"best response, seed {run.seed}" + (f" from {run.init}" if run.init else "")
+    name = "best response" if run.tasks == 1 else "informed ego"
+    return f"{name}, seed {run.seed}" + (f" from {run.init}" if run.init else "")
 
 
 def include_models(found: BestResponse, models: Mapping[str, Mapping[str, np.ndarray]]) -> BestResponse:
@@ -318,23 +320,37 @@ def write_responses(
 ) -> Path:
     """Add the best responses of finished jobs to the file `RESPONSES_FILE` in a folder. Return the file's path.
 
-    A new entry includes the file's earlier training runs on the same tasks. Earlier entries that share only some of
-    the tasks are removed. The version in the file is a hash of all entries.
+    A new entry includes the file's earlier training runs on the same tasks.
 
     Args:
         jobs: training jobs; unfinished jobs are skipped.
         folder: folder of the file.
         models: model -> task id -> mean returns, see `include_models`.
     """
-    path, finished = folder / RESPONSES_FILE, [job for job in jobs if job.is_finished()]
-    known = {one.tasks: one for one in (read_best_responses(path).behaviours if path.is_file() else ())}
-    found = {}
-    for ids, own in grouped(finished, lambda job: tuple(task.task_id for task in job.tasks)).items():
+    known = {one.tasks: one for one in _stored_responses(folder)}
+    found = []
+    for ids, own in grouped(
+        [job for job in jobs if job.is_finished()], lambda job: tuple(task.task_id for task in job.tasks)
+    ).items():
         before = known[ids].seeds if ids in known else ()
-        found[ids] = choose_best_response(own[0].tasks, [*before, *map(trained_response, own)])
-    new = {task for ids in found for task in ids}
-    kept = [one for ids, one in known.items() if new.isdisjoint(ids)]
-    behaviours = tuple(include_models(one, models) for one in (*kept, *found.values()))
+        found.append(choose_best_response(own[0].tasks, [*before, *map(trained_response, own)]))
+    return add_responses(found, folder, models)
+
+
+def _stored_responses(folder: Path) -> tuple[BestResponse, ...]:
+    path = folder / RESPONSES_FILE
+    return read_best_responses(path).behaviours if path.is_file() else ()
+
+
+def add_responses(found: Sequence[BestResponse], folder: Path, models: Mapping[str, Mapping[str, np.ndarray]]) -> Path:
+    """Add best responses to the file `RESPONSES_FILE` in a folder. Return the file's path.
+
+    Earlier entries that share tasks with the new ones are removed. For all entries, `include_models` chooses between
+    trained egos and stored models. The version in the file is a hash of all entries.
+    """
+    new, path = {task for one in found for task in one.tasks}, folder / RESPONSES_FILE
+    kept = [one for one in _stored_responses(folder) if new.isdisjoint(one.tasks)]
+    behaviours = tuple(include_models(one, models) for one in (*kept, *found))
     card = BestResponseCard(json_hash(to_builtins(behaviours)), PROTOCOL, ABOUT, behaviours)
     write_best_responses(path, card)
     return path

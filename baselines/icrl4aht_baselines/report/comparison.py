@@ -42,7 +42,7 @@ from icrl4aht_baselines.report.statistics import MeanInterval, holm_corrected
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.adaptation import published_adaptation_table
-from icrl4aht_data.benchmark.best_responses import read_best_responses
+from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_reference_returns
 from icrl4aht_data.errors import OptionError
@@ -238,7 +238,7 @@ def render_comparison(stored: StoredResults) -> str:
         trainings=describe_training_runs(),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
         measured=f"{measured.about.rstrip('.')} (version {measured.version}).",
-        cells=f"{len(scored)} of {len(scales)} cells",
+        cells=f"{len(scored)} of {sum(cell.kind == 'test' for cell in scales)} cells",
         scored=", ".join(dict.fromkeys(cell.layout for cell in scored)) or "none",
         alpha=f"{_SIGNIFICANT:g}",
         rows=f"{len(stored.table):,}",
@@ -396,15 +396,18 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
     return markdown_table(["model", *TEST_LAYOUTS, "worst teammate", "regret"], body, right=len(TEST_LAYOUTS) + 2)
 
 
+def _published_responses() -> list[BestResponse]:
+    """Return the best responses to the published test teammates."""
+    return [one for one in read_best_responses().behaviours if one.split == "test" and one.layout in TEST_LAYOUTS]
+
+
 def training_ranges() -> dict[str, float]:
     """Return layout -> mean difference of the highest and lowest return of best responses' training runs.
 
     The mean is over the test behaviours that have several training runs.
     """
     returns = [
-        (one.layout, [run.mean_return for run in one.seeds])
-        for one in read_best_responses().behaviours
-        if one.split == "test" and len(one.seeds) > 1
+        (one.layout, [run.mean_return for run in one.seeds]) for one in _published_responses() if len(one.seeds) > 1
     ]
     return {
         layout: float(np.mean([max(of) - min(of) for _, of in own]))
@@ -414,7 +417,7 @@ def training_ranges() -> dict[str, float]:
 
 def describe_training_runs() -> str:
     """Return sentences on how the best responses were trained, or an empty string if there are none."""
-    behaviours = read_best_responses().behaviours
+    behaviours = _published_responses()
     trained = [training for one in behaviours for training in one.seeds]
     if not trained:
         return ""

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from icrl4aht_baselines.evaluate.evaluator import ControlledResults
-from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS
+from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks
 from icrl4aht_baselines.report.results import (
     EPISODE_BLOCKS,
     TASK_KINDS,
@@ -42,7 +42,7 @@ from icrl4aht_baselines.report.statistics import (
 )
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.best_responses import best_responses, read_best_responses
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, LEAST_HEADROOM, TRACKS
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LEAST_HEADROOM, PREFERENCE, TRACKS
 from icrl4aht_data.benchmark.reference_returns import (
     has_headroom,
     read_reference_returns,
@@ -99,8 +99,10 @@ CellScales = Mapping[ResultCell, CellScale]
 
 @cache
 def bundled_ids_by_cell() -> dict[ResultCell, list[str]]:
-    """Return the ids of the test and validation tasks of both benchmark tracks, by result cell."""
-    found = grouped([task for split in EVALUATION_SPLITS for task in bundled_tasks_by_id(split).values()], cell_of)
+    """Return the ids of the test and validation tasks of both benchmark tracks, and of the test tasks of the track
+    `preference`, by result cell."""
+    published = [task for split in EVALUATION_SPLITS for task in bundled_tasks_by_id(split).values()]
+    found = grouped([*published, *bundled_tasks(PREFERENCE, "test")], cell_of)
     return {cell: [task.task_id for task in found[cell]] for cell in sorted_cells(found)}
 
 

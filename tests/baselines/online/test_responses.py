@@ -13,7 +13,13 @@ import pytest
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.protocols import test_tasks as tasks_of
 from icrl4aht_baselines.online import adaptation, responses
-from icrl4aht_baselines.online.adaptation import AdaptationJob, adaptation_entry, adaptation_jobs, write_adaptation
+from icrl4aht_baselines.online.adaptation import (
+    AdaptationJob,
+    adaptation_entry,
+    adaptation_jobs,
+    informed_responses,
+    write_adaptation,
+)
 from icrl4aht_baselines.online.responses import ResponseJob, ResponseOptions
 from icrl4aht_baselines.training import trainer
 from icrl4aht_generation.teammates.distances import common_records
@@ -113,29 +119,35 @@ def test_headroom_table_shows_mean_difference_and_interval(tmp_path):
 
 
 @pytest.mark.slow
-def test_scripts_play_the_tasks_of_track_preference(tmp_path, monkeypatch):
-    """Scripts are measured once for all training seeds; `stay` earns nothing where its teammate cannot deliver."""
+def test_scripts_and_informed_egos_of_track_preference_are_stored(tmp_path, monkeypatch):
+    """Scripts play all sets in one job; an informed ego is the best response in the test tasks among its tasks."""
     monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded", 2))
-    tasks = tasks_of(PREFERENCE, "rooms-0-46")[:2]
+    tasks = [task for task in bundled_tasks(PREFERENCE, "test") if task.layout.name == "rooms-0-46"][:2]
+    crossed = adaptation.cross_dishes(tasks)
+    assert len({(json.dumps(task.teammate), task.recipes) for task in crossed}) == len(crossed) == 4
+    ids = {task.task_id for task in crossed}
+    assert {task.task_id for task in tasks} < ids
     jobs = adaptation_jobs({"few": tasks}, 2, TINY, tmp_path)
-    assert [job.kind for job in jobs] == [*EGO_KINDS, *SCRIPTS, *EGO_KINDS]
-    for job in jobs:
-        if job.kind in SCRIPTS:
-            assert job.updates == 1
-            job.run()
+    assert [job.kind for job in jobs] == [*EGO_KINDS, *EGO_KINDS, *SCRIPTS]
+    for job in jobs[-len(SCRIPTS) :]:
+        assert job.updates == 1
+        job.run()
     earned = {job.kind: job.result()["returns"] for job in jobs if job.is_finished()}
-    assert all(returns.keys() == {task.task_id for task in tasks} for returns in earned.values())
+    assert all(returns.keys() == ids for returns in earned.values())
     means = {kind: np.mean(list(returns.values())) for kind, returns in earned.items()}
-    assert means["oracle"] > means["search"], means
-    assert means["oracle"] > means["stay"], means
+    assert means["oracle"] > max(means["search"], means["stay"]), means
     assert not adaptation_entry("few", jobs), "no trained ego is finished"
     for job in jobs[:2]:
         (tmp_path / job.name).mkdir()
-        content = {"settings": job.settings, "returns": {task.task_id: 1.0 for task in tasks}}
+        content = {"settings": job.settings, "returns": {task.task_id: 7.0 for task in crossed}}
         (tmp_path / job.name / "result.json").write_text(json.dumps(content))
     entry = adaptation_entry("few", jobs)
-    assert entry["scripts"] == {kind: round(mean, 3) for kind, mean in means.items()}
-    assert entry["layouts"] == {"rooms-0-46": {"informed": 1.0, "episodic": 1.0, **entry["scripts"]}}
+    assert entry and entry["number"] == 4
+    assert entry["scripts"] == pytest.approx(means, abs=1e-3)
+    assert entry["layouts"] == {"rooms-0-46": {"informed": 7.0, "episodic": 7.0, **entry["scripts"]}}
+    found = informed_responses(jobs)
+    assert [one.tasks for one in found] == [(task.task_id,) for task in tasks], "other tasks are no test tasks"
+    assert {(one.best, one.agent, one.seeds[0].tasks) for one in found} == {(7.0, "informed ego, seed 0", 4)}
 
 
 def test_headroom_tables_in_cards_and_docs_match_stored_results():
