@@ -84,8 +84,8 @@ class HubClient:
         unanswered: dict[str, float] = {}
 
         def before_request(request: Any) -> None:
-            # Waiting is timed per address, since a server may answer only some addresses, and also per host, since one
-            # call of the client may request several addresses of a host.
+            # The wait is timed per address, because a server may answer only some addresses. It is also timed per host,
+            # because one call of the client may request several addresses of a host.
             now, keys = time.monotonic(), (str(request.url), request.url.host)
             first = min(unanswered.setdefault(key, now) for key in keys)
             left = first + _TIMEOUT - now

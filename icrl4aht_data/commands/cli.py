@@ -166,7 +166,7 @@ def _exit_with_error(message: str, code: int) -> None:
 
 
 def _os_error_message(error: OSError) -> str:
-    """Return the message for an OSError; the name of a temporary file or lock is replaced by the user's file name."""
+    """Return the message for an OSError, with the name of the file that was written, not of a temporary file."""
     if error.errno is None or error.filename is None:
         return str(error)
     path = Path(final_name(os.fsdecode(error.filename)))

@@ -17,11 +17,11 @@ CHECKPOINT_BYTES = 64 * 2**20
 def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
     """Return the folder of a learned teammate's checkpoint.
 
-    In a release, the name of the folder is a hash; in a teammate suite (trained populations), it is a path.
+    A release names the folders of checkpoints by hashes. A teammate suite (trained populations) has relative paths.
 
     Args:
         folder: the folder `TEAMMATES` of a release, or the folder of a suite.
-        teammate: the task's entry `teammate`, of kind "rl".
+        teammate: the task's field `teammate`, with kind "rl".
     """
     theta = teammate["theta"]
     return folder / (theta["sha256"] if (folder / theta["sha256"]).is_dir() else theta["checkpoint"])

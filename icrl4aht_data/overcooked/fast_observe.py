@@ -72,7 +72,7 @@ class _Renderer:
         self._columns = columns(layout)
         fixed = fixed_channels(layout, canonical)
         self._agent: int = fixed.start // 2  # number A of one agent's channels; the channels of both agents come first
-        self._first: int = fixed.stop  # first of the channels that can change: items, recipes and timers
+        self._first: int = fixed.stop  # index of the first channel after these: items, recipes and timers
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
         self._recipes = np.append(np.uint8(0), possible_recipes(layout))
         self._in_window = layout.window_position.astype(np.intp)

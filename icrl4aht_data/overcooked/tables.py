@@ -321,7 +321,7 @@ def packed_channels(types: int, delivery: bool, layout: Layout | None = None) ->
 
 
 def _channel_bits(layout: Layout, types: int, delivery: bool) -> ChannelBits:
-    """Return the `ChannelBits` for `types` ingredient types, with or without delivery; empty if `types` is 0."""
+    """Return the `ChannelBits` of a layout with `types` types of ingredients; there are none if `types` is 0."""
     channels = packed_channels(types, delivery, layout) if types else {}
     shift, mask = np.array(list(channels.values()), np.uint32).reshape(-1, 2).T
     return ChannelBits(shift, mask, np.array([name.startswith(("self", "other")) for name in channels], bool))

@@ -51,7 +51,7 @@ def choose_histories(selection: Selection, share: float, seed: int) -> np.ndarra
     names, of_task = selection.index.values("task_id"), defaultdict(list)
     columns = [selection.column_codes("task_id"), selection.column("env_idx"), selection.column("learner")]
     for row, (code, stream, learner) in enumerate(np.stack(columns, axis=1).tolist()):
-        # Names omit learner 0, so ranks remain as they were when releases had one learner per task.
+        # Learner 0 is left out, so that releases with one learner per task keep the same held-out histories.
         name = (names[code], stream, learner) if learner else (names[code], stream)
         of_task[code].append((_rank(seed, *name), row))
     # The history with the highest rank in each task always stays in training.

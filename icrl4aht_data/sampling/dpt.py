@@ -198,7 +198,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         for_steps = random[4 : 4 + drawn].T
 
         low, high = self._draws.steps(i)
-        members, begins, ends = self._tasks
+        members, begins, ends = self._histories_by_task
         task = scale_to_range(for_task, len(begins))
         weights = self._draws.history_weights(low, high)
         weights = None if weights is None else weights[members]
@@ -213,7 +213,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         return query, query_steps, context, self._transition_steps(transitions)
 
     @cached_property
-    def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _histories_by_task(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions of histories sorted by task, int64 (H,), and the start and end of each task in this order."""
         _, first, task = np.unique(self.dataset.column_codes("task_id"), return_index=True, return_inverse=True)
         task = np.argsort(np.argsort(first))[task]  # tasks are renumbered in order of first appearance

@@ -156,7 +156,7 @@ class HistoryDraws:
         return np.ldexp(self.weights, -np.frexp(self.weights.max())[1])
 
     def options(self) -> dict[str, Any]:
-        """Return the options that determine the draws, as JSON."""
+        """Return the options that determine the draws, as values that JSON can store."""
         curriculum = self.curriculum
         return {
             "weights": self.weights if isinstance(self.weights, str) else self.weights.tolist(),

@@ -44,7 +44,11 @@ def release(tmp_path_factory) -> Path:
 
 
 def fake_evaluate(last: float, last_cleared: float):
-    """Return a replacement for `evaluate` with invented returns: 0 in the first episode, then `last` plus the seed."""
+    """Return a replacement for `evaluate` with fixed returns, to which the seed is added after the first episode.
+
+    The agents in `EARNED` have the returns stated there. Others have 0 in the first episode, then `last`, or
+    `last_cleared` in runs with a control.
+    """
 
     def evaluate(agent, make, tasks, protocol, *, seeds, out, details, played, control=None):
         name = agent if control is None else controlled_name(agent, control)

@@ -135,8 +135,8 @@ class HubState:
     """Repositories and file contents of a test Hub, and the addresses of its two servers.
 
     Args:
-        root: empty folder for the contents of files.
-        token: access token that allows writing, and reading private repositories.
+        root: empty folder in which file contents are stored.
+        token: access token for writing, and for reading private repositories.
     """
 
     def __init__(self, root: Path, token: str) -> None:

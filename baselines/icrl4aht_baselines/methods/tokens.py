@@ -72,7 +72,7 @@ def batch_steps(batch: ADBatch, view: BatchView) -> StepInput:
 
 
 def input_step(ego_input: Any) -> StepInput:
-    """Convert the input of an acting ego from `agents.EgoInput` to `StepInput`."""
+    """Convert an `agents.EgoInput` to a `StepInput`."""
     return StepInput(ego_input.obs, ego_input.prev_action, ego_input.prev_reward, ego_input.prev_teammate_action)
 
 

@@ -95,8 +95,8 @@ def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> P
     """
     if labeller is not None and labeller.sees != policy.sees:
         raise OptionError(
-            f"the labeller's input is {labeller.sees}, expected {policy.sees} as for the agent; choose a labeller with "
-            f"the same input"
+            f"the labeller's input is {labeller.sees}, expected the agent's input {policy.sees}; choose a labeller "
+            f"with the same input"
         )
     params = policy.params, None if labeller is None else labeller.params
 

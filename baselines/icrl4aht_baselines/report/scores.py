@@ -345,9 +345,9 @@ def blocks_text(cells: Sequence[CellReturns]) -> str:
 
 
 class Headline(NamedTuple):
-    """Summary of a run's results on one kind of tasks.
+    """Summary of an evaluation run on one kind of tasks.
 
-    The numbers are of completely played result cells with headroom, or of all played cells if there are none.
+    Only result cells with headroom whose tasks were all played count. If a run has no such cells, all its cells count.
 
     Attributes:
         label: label of the run, with symbols for overlap of its training data with the tasks.

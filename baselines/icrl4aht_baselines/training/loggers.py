@@ -49,7 +49,7 @@ def _tensorboard(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
 
 @contextmanager
 def _wandb(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
-    """Log to a run of Weights & Biases, which is offline unless `WANDB_MODE` is set."""
+    """Log to a run of Weights & Biases. The run is offline unless `WANDB_MODE` says otherwise."""
     import wandb
 
     mode, project = os.environ.get("WANDB_MODE", "offline"), os.environ.get("WANDB_PROJECT", PACKAGE)

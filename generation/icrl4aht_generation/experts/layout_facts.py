@@ -135,7 +135,7 @@ def _shortest_walks(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
     for action in range(4):
         end = ends[..., action]
         faced = layout.ahead[end, FACING_OF[action]].astype(int)
-        # Assign turns and moves separately, because no entry of `ways` may occur twice in one assignment.
+        # Turns and moves are assigned separately: of two values for one entry of `ways`, NumPy would keep only one.
         for walks in (False, True):
             obstacle, start = np.nonzero((end != room) == walks)
             own = obstacle[:, None], room, faced[obstacle, start][:, None]

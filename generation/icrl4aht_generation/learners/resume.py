@@ -308,7 +308,7 @@ class RunLog:
             file.flush()
 
     def sync(self) -> None:
-        """Flush the metrics to the disk; call this before saving the state after the logged updates."""
+        """Flush the metrics to the disk; call this before a state is saved, which must not be ahead of the log."""
         if self._writes:
             os.fsync(self._metrics.fileno())
 

@@ -132,7 +132,7 @@ class SpreadTeammate(Struct, forbid_unknown_fields=True):
 
 
 class LayoutSpread(Struct, forbid_unknown_fields=True):
-    """Teammates chosen for a layout, in the order in which they were chosen, and counts of candidates.
+    """Teammates chosen for a layout, first choice first, and the number of candidates that passed each filter.
 
     Attributes:
         layout: short name of a training layout.

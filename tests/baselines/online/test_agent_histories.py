@@ -111,7 +111,7 @@ def test_histories_can_be_labelled_by_another_agent(dataset):
     assert (found.actions == STAY).all()
     # The labelling agent counts previous `stay` actions; the first step has no previous action.
     np.testing.assert_array_equal(found.expert_actions[0], (1 + np.maximum(np.arange(1000) - 1, 0)) % 6)
-    with pytest.raises(OptionError, match="the labeller's input is state, expected ego_input as for the agent"):
+    with pytest.raises(OptionError, match="the labeller's input is state, expected the agent's input ego_input"):
         agent_histories.with_noise(idle_agent(None), 10, AGENTS["oracle"](tasks[0].layout))
 
 

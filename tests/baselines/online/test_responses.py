@@ -24,9 +24,9 @@ from icrl4aht_baselines.online.responses import ResponseJob, ResponseOptions
 from icrl4aht_baselines.training import trainer
 from icrl4aht_generation.teammates.distances import common_records
 
-from icrl4aht_data.benchmark.adaptation import EGO_KINDS, SCRIPTS, adaptation_table, read_adaptation
+from icrl4aht_data.benchmark.adaptation import EGO_KINDS, SCRIPTS, adaptation_table, read_adaptation, task_set_name
 from icrl4aht_data.benchmark.best_responses import read_best_responses
-from icrl4aht_data.benchmark.facts import PREFERENCE
+from icrl4aht_data.benchmark.facts import PREFERENCE, PREFERENCE_LAYOUTS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.text import card_file
 from tests.helpers.paths import ROOT
@@ -151,10 +151,19 @@ def test_scripts_and_informed_egos_of_track_preference_are_stored(tmp_path, monk
 
 
 def test_headroom_tables_in_cards_and_docs_match_stored_results():
+    """The page has means over the layouts of the track `preference`, and the least and the greatest difference."""
     page = (ROOT / "docs" / "preference.md").read_text(encoding="utf-8")
     entries = read_adaptation(card_file("adaptation.json").parent)
     assert adaptation_table(entries) in card_file("adaptation.md").read_text(encoding="utf-8")
-    assert adaptation_table([one for one in entries if one["tasks"].startswith(PREFERENCE)], layouts=False) in page
+    own = [entry for entry in entries if entry["tasks"].startswith(f"{PREFERENCE}-test-")]
+    assert {entry["tasks"] for entry in own} == {
+        task_set_name(PREFERENCE, "test", layout) for of in PREFERENCE_LAYOUTS.values() for layout in of
+    }
+    returns = [{**entry["scripts"], **{kind: entry["returns"][kind]["0"] for kind in EGO_KINDS}} for entry in own]
+    means = [np.mean([of[name] for of in returns]) for name in (*SCRIPTS, "episodic", "informed")]
+    differences = [of["informed"] - of["episodic"] for of in returns]
+    numbers = [f"{mean:.1f}" for mean in means] + [f"+{min(differences):.1f} to +{max(differences):.1f}"]
+    assert f"| {' | '.join(numbers)} |" in page
 
 
 def test_all_episodes_of_a_best_response_are_split_into_choice_and_report(tmp_path, monkeypatch):
@@ -176,7 +185,10 @@ def test_headroom_job_with_fewer_tasks_than_needed_raises_error(tmp_path):
 
 @pytest.mark.slow
 def test_tiny_best_response_and_headroom_jobs_finish(tmp_path, monkeypatch):
-    """Train a best response for one task, and two egos that measure headroom; repeated calls do nothing."""
+    """Train a best response for one task, and the two egos whose returns are compared.
+
+    A finished job does nothing.
+    """
     monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded", 2))
     monkeypatch.setattr(adaptation, "MEASURED_EPISODES", 2)
     monkeypatch.setattr(trainer, "can_draw", lambda: False)

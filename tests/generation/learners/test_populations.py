@@ -186,10 +186,10 @@ def test_slot_weights_follow_the_equations_of_the_paper(algorithm, memory):
 
 
 def random_returns(k: int, rng: np.random.Generator, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return random mean returns of pairs of policies and a mask of the seen pairs, both of shape (2k, 2k).
+    """Return a random matrix of mean returns and a mask of the pairs that played, both of shape (2k, 2k).
 
-    Returns are float32, and NaN for unseen pairs.
-    Only pairs of a best response as the ego and a confederate as the teammate can be seen.
+    A best response as the ego has played with a confederate as the teammate with probability `share`; no others have.
+    The returns (float32) of pairs that did not play are NaN.
     """
     seen = np.zeros((2 * k, 2 * k), bool)
     seen[k:, :k] = rng.random((k, k)) < share

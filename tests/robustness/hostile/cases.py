@@ -88,14 +88,14 @@ def terabyte_file(path: Path, root: Path) -> None:
         stream.truncate(TERABYTE)
 
 
-def file_of(text: str | bytes) -> Make:
+def file_writer(text: str | bytes) -> Make:
     """Return a function that creates a file with the given content."""
     return lambda path, root: path.write_bytes(text if isinstance(text, bytes) else text.encode())
 
 
 def deep_json(levels: int) -> Make:
     """Return a function that creates a file of nested JSON objects."""
-    return file_of('{"a":' * levels + "1" + "}" * levels)
+    return file_writer('{"a":' * levels + "1" + "}" * levels)
 
 
 def change_json(name: str, change: Callable[[Any], Any]) -> Spoil:
@@ -162,7 +162,7 @@ def change_table(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
 def npy_header_only(header: str, version: bytes = b"\x01\x00", length: int | None = None) -> Make:
     """Return a function that creates a .npy file that ends after the header."""
     size = len(header) if length is None else length
-    return file_of(b"\x93NUMPY" + version + size.to_bytes(2 if version[0] == 1 else 4, "little") + header.encode())
+    return file_writer(b"\x93NUMPY" + version + size.to_bytes(2 if version[0] == 1 else 4, "little") + header.encode())
 
 
 def change_hdf5(change: ChangeFile, name: str = SHARD) -> Spoil:
@@ -310,7 +310,7 @@ add_hashed_cases("histories", {"info: histories 2**62": change_info(histories=2*
 _size = change_json(INFO, lambda value: value["shards"].update({SHARD: 2**61}))
 add_hashed_cases(r"expected 2,305,843,009,213,693,952 bytes, found \d", {"info: shard of 2**61 bytes": _size})
 add_hashed_cases("shards: expected", {"info: no shards": change_info(shards={})})
-_digits = file_of('{"format_version": ' + "9" * 10**6 + "}")
+_digits = file_writer('{"format_version": ' + "9" * 10**6 + "}")
 add_hashed_cases(
     "malformed", {"info: deep": replace_file(INFO, deep_json(100_000)), "info: digits": replace_file(INFO, _digits)}
 )
@@ -321,7 +321,7 @@ _nested = json.loads("[" * 400 + "]" * 400)
 _deep_theta = change_lines(lambda values: values[0]["teammate"]["theta"].update(x=_nested), TASKS)
 _deep_files = {f"deep: {name}": replace_file(name, deep_json(500)) for name in (INFO, PROVENANCE)}
 add_hashed_cases("found more levels", _deep_files | {"tasks: deep theta": _deep_theta})
-_endless_line = file_of(b"a" * 2**24)
+_endless_line = file_writer(b"a" * 2**24)
 for _of, _file in {"index": HISTORIES, "tasks": TASKS}.items():
     add_hashed_cases("expected at most", {f"{_of}: one endless line": replace_file(_file, _endless_line)})
 add_hashed_cases("line 1: ", {"index: a surrogate": set_entry(task_id="\ud800")})
