@@ -8,12 +8,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, bundled_tasks, get_protocol, plan_tasks
 from icrl4aht_baselines.evaluate.results import Result, write_result
 from icrl4aht_baselines.report.results import EvaluationRun, as_run
 
 from icrl4aht_data.benchmark.best_responses import BestResponse, BestResponseCard, TrainingRun, write_best_responses
-from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.facts import PREFERENCE, TRACKS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, read_reference_returns, stay_returns
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 
@@ -59,8 +59,12 @@ SPAN = 20.0
 """Margin over `stay` of the best responses that `write_invented_responses` invents, for teammates with headroom."""
 
 
-def write_invented_responses(path: Path) -> Path:
-    """Write invented best responses to all teammates of test tasks; a layout's five H4 teammates share a response."""
+def write_invented_responses(path: Path, preference: bool = False) -> Path:
+    """Write invented best responses to all teammates of test tasks; a layout's five H4 teammates share a response.
+
+    Args:
+        preference: whether the test tasks of the track `preference` also have best responses.
+    """
     stays, headroom, behaviours = stay_returns("seeded"), read_reference_returns("seeded"), []
     for (layout, family), egos in headroom.items():
         tasks = [task for task in TEST_TASKS if (task.layout.name, task.teammate_family) == (layout, family)]
@@ -68,6 +72,9 @@ def write_invented_responses(path: Path) -> Path:
             best = float(np.mean([stays[task.task_id] for task in own])) + SPAN * has_headroom(egos)
             ids, trained = tuple(task.task_id for task in own), (TrainingRun(1, 10, best),)
             behaviours.append(BestResponse(layout, family, "test", ids, trained, best, "best response, seed 1"))
+    for task in bundled_tasks(PREFERENCE, "test") if preference else ():
+        names, best = (task.layout.name, task.teammate_family, "test", (task.task_id,)), stays[task.task_id] + SPAN
+        behaviours.append(BestResponse(*names, (TrainingRun(0, 10, best, tasks=2),), best, "informed ego, seed 0"))
     write_best_responses(path, BestResponseCard("7", "seeded", "Invented.", tuple(behaviours)))
     return path
 
@@ -90,9 +97,9 @@ def write_results(
     """
     settings = {"agent": agent, "seeds": [0, 1, 2], "protocol": get_protocol("seeded").settings}
     details |= {} if trained_on is None else {"trained_on": [*trained_on]}
-    for task in TEST_TASKS:
-        if task.track == track:
-            values = [value + offset * task.teammate["theta_id"] for value in curve]
-            found = {**settings, "code_version": version("icrl4aht-data"), "details": details}
-            write_result(folder, Result(task.task_id, found, [values] * 3))
+    control = "swapped" if details.get("swapped") else None
+    for plan in plan_tasks(bundled_tasks(track, "test"), get_protocol("seeded"), control):
+        values = [value + offset * plan.task.teammate["theta_id"] for value in curve]
+        found = {**settings, "code_version": version("icrl4aht-data"), "details": details}
+        write_result(folder, Result(plan.task.task_id, found, [values] * 3, [*plan.partners]))
     return folder

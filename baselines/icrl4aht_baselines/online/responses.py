@@ -303,15 +303,14 @@ def include_models(found: BestResponse, models: Mapping[str, Mapping[str, np.nda
     run = best_training_run(found.seeds)
     found = structs.replace(found, best=run.mean_return, agent=_ego_name(run))
     names = [name for name, returns in models.items() if returns.keys() >= {*found.tasks}]
-    if not names:
+    if not names or run.choice is None:  # without `choice`, egos can only be compared by the reported episodes
         return found
     earned = np.array([np.mean([models[name][task] for task in found.tasks], axis=0) for name in names])
     others = (earned.sum(axis=1, keepdims=True) - earned) / (len(REPORT_SEEDS) - 1)  # shape (models, seeds)
-    least = -np.inf if run.choice is None else run.choice
     of_models = np.take_along_axis(earned, others.argmax(axis=0)[None], axis=0)[0]
-    best = np.where(others.max(axis=0) > least, of_models, run.mean_return)
+    best = np.where(others.max(axis=0) > run.choice, of_models, run.mean_return)
     means = earned.mean(axis=1)
-    agent = names[int(means.argmax())] if means.max() > least else found.agent
+    agent = names[int(means.argmax())] if means.max() > run.choice else found.agent
     return structs.replace(found, best=float(best.mean()), agent=agent)
 
 

@@ -39,11 +39,11 @@ from icrl4aht_baselines.report.scores import (
     score_difference,
 )
 from icrl4aht_baselines.report.statistics import MeanInterval, holm_corrected
-from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission
+from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission, track_tasks
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.adaptation import published_adaptation_table
 from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
-from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE
 from icrl4aht_data.benchmark.reference_returns import read_reference_returns
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import add_legend_below, average_in_blocks, axis_limits, save_figure
@@ -58,6 +58,7 @@ CURVE_COLUMNS = ["agent", "protocol", "control", "layout", "episode", "return"]
 
 _PANELS = 6
 _SIGNIFICANT = 0.05
+_PRIMARY_TRACK = "teammate"  # N on it is the primary endpoint, see docs/protocol.md
 
 
 class SecondaryEffect(NamedTuple):
@@ -78,8 +79,12 @@ class SecondaryEffect(NamedTuple):
 
 
 SecondaryEffects = Mapping[tuple[str, ...], SecondaryEffect]
-"""All effects that the page tests besides the primary endpoint. Keys: (agent, "cleared") for M, (agent, "swapped") for
-P, (agent, "layout") for N on the track `layout`, and (track, agent, other agent) for differences of N."""
+"""All effects that the page tests besides the primary endpoint. Keys: ("N", track, agent), ("difference", track,
+agent, other agent) for differences of N, ("cleared", where, agent) for M, and ("swapped", where, agent) for P; `where`
+is `PUBLISHED` or `PREFERENCE`."""
+
+PUBLISHED = "published"
+"""Name for both published tracks together, over which M and P are averaged."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +110,8 @@ class StoredResults:
                 the agent's main results.
         """
         table = self.table
-        chosen = (table["protocol"] == SUBMITTED_PROTOCOL) & (table["control"] == control) & (table["kind"] == "test")
+        chosen = (table["protocol"] == SUBMITTED_PROTOCOL) & (table["control"] == control)
+        chosen &= table["kind"].isin(("test", PREFERENCE))
         found = dict(iter(table[chosen].groupby("agent", sort=False)))
         return {agent: returns_by_cell(found[agent]) for agent in [*self.agents] if agent in found}
 
@@ -172,11 +178,14 @@ def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
 
 
 def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
-    """Return stored results plus submitted ones, which replace stored ones if `Submission.update` is set."""
+    """Return stored results plus submitted ones.
+
+    If `Submission.update` is set, they replace the agent's stored results on the same layouts.
+    """
     controls = {one.control for one in found.evaluations}
-    tables, curves = [], defaultdict(list)
+    tables, curves, tasks = [], defaultdict(list), [*track_tasks(found.tracks).values()]
     for one in found.evaluations:
-        run = as_run([Result(task, one.settings, returns) for task, returns in one.returns.items()], found.agent)
+        run = as_run([Result(task, one.settings, returns) for task, returns in one.returns.items()], found.agent, tasks)
         tables.append(run.table.assign(agent=found.agent, training=one.training, control=one.control))
         for cell, returns in run.cells.items():
             curves[one.control, cell.layout].append(returns)
@@ -188,6 +197,7 @@ def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
 
     def replace_rows(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
         is_replaced = (old["agent"] == found.agent) & (old["control"].isin(controls) | ("" in controls))
+        is_replaced &= old["layout"].isin(new["layout"].unique())
         return pd.concat([part for part in (old[~is_replaced], new) if len(part)], ignore_index=True)
 
     facts = found.facts if "" in controls else stored.agents[found.agent]
@@ -261,20 +271,20 @@ def secondary_effects(
 
     Agents are compared with the agent that has the next lower N on the track, paired by task, seed and training run.
     """
-    found = {}
-    for track in TRACKS:
+    found: dict[tuple[str, ...], MeanInterval] = {}
+    for track in ALL_TRACKS:
         cells = cells_with_headroom(scales, track)
         scores = {agent: score.total for agent, of in results.items() if (score := find_score(of, cells, scales))}
-        if track == "layout":
-            found |= {(agent, track): total for agent, total in scores.items()}
+        if track != _PRIMARY_TRACK:
+            found |= {("N", track, agent): total for agent, total in scores.items()}
         for one, other in pairwise(sorted(scores, key=lambda agent: -scores[agent].mean)):
-            found[track, one, other] = score_difference(results[one], results[other], cells, scales)
+            found["difference", track, one, other] = score_difference(results[one], results[other], cells, scales)
     for control, block in (("cleared", "all"), ("swapped", "last 20")):
         others = stored.returns(control)
         for agent, cells in results.items():
-            chosen = _controlled_cells(cells, scales)
-            difference = block_difference(cells, others.get(agent, {}), chosen, block)
-            found |= {(agent, control): difference} if difference else {}
+            for where, chosen in _controlled_cells(cells, scales).items():
+                difference = block_difference(cells, others.get(agent, {}), chosen, block)
+                found |= {(control, where, agent): difference} if difference else {}
     corrected = holm_corrected({key: effect.p for key, effect in found.items()})
     return {key: SecondaryEffect(effect, corrected[key]) for key, effect in found.items()}
 
@@ -295,20 +305,21 @@ def agents_table(
             hours = "" if facts.core_hours is None else f"{facts.core_hours:g} core-hours"
             texts = [facts.data, facts.labels, ", ".join(filter(None, (facts.steps, hours))) or "–"]
         row = [f"`{agent}`{overlap_marks(marks)}", *texts]
-        for track in TRACKS:
-            score, tested = find_score(cells, cells_with_headroom(scales, track), scales), effects.get((agent, track))
+        for track in ALL_TRACKS:
+            score = find_score(cells, cells_with_headroom(scales, track), scales)
+            tested = effects.get(("N", track, agent))
             total = tested.text(2, "") if tested else _format_interval(score and score.total)
             row += [total, _format_interval(score and score.middle)]
         body.append(row)
-    scored = [f"{name}, {track}" for track in TRACKS for name in ("N", "IQM")]
+    scored = [f"{name}, {track}" for track in ALL_TRACKS for name in ("N", "IQM")]
     return markdown_table(["model", "data", "labels", "budget", *scored], body)
 
 
 def describe_differences(effects: SecondaryEffects) -> str:
     """Return a list item for each track with the differences of N between agents."""
     lines = []
-    for track in TRACKS:
-        compared = {key[1:]: effect for key, effect in effects.items() if len(key) == 3 and key[0] == track}
+    for track in ALL_TRACKS:
+        compared = {key[2:]: effect for key, effect in effects.items() if key[:2] == ("difference", track)}
         texts = [f"`{one}` - `{other}` {effect.text(2)}" for (one, other), effect in compared.items()]
         lines += [f"* Track `{track}`: {', '.join(texts)}."] if texts else []
     return "\n".join(lines) or "No two models have a score on the same track."
@@ -318,22 +329,30 @@ def controls_table(results: Mapping[str, AgentReturns], scales: CellScales, effe
     """Return table 2: benefit M of memory, benefit P of the right context, and mean returns in blocks of episodes.
 
     Means are over the combinations of layout and family that the agent played and that have headroom, or over all that
-    it played if none of them has headroom.
+    it played if none of them has headroom, separately for the published tracks and the track `preference`.
     """
     body = []
-    for agent, cells in results.items():
-        tested = (effects.get((agent, control)) for control in ("cleared", "swapped"))
-        row = [f"`{agent}`", *(effect.text(1) if effect else "–" for effect in tested)]
-        for block in EPISODE_BLOCKS:
-            played = [cells[cell].blocks for cell in _controlled_cells(cells, scales)]
-            parts = [blocks[block] for blocks in played if block in blocks]
-            row.append(f"{mean_over_cells(parts):z.1f}" if parts else "–")
-        body.append(row)
-    return markdown_table(["model", "M", "P", *EPISODE_BLOCKS], body, right=len(EPISODE_BLOCKS))
+    for where in (PUBLISHED, PREFERENCE):
+        for agent, cells in results.items():
+            played = [cells[cell].blocks for cell in _controlled_cells(cells, scales).get(where, ())]
+            if not played:
+                continue
+            tested = (effects.get((control, where, agent)) for control in ("cleared", "swapped"))
+            row = [f"`{agent}`", where, *(effect.text(1) if effect else "–" for effect in tested)]
+            for block in EPISODE_BLOCKS:
+                parts = [blocks[block] for blocks in played if block in blocks]
+                row.append(f"{mean_over_cells(parts):z.1f}" if parts else "–")
+            body.append(row)
+    return markdown_table(["model", "tracks", "M", "P", *EPISODE_BLOCKS], body, right=len(EPISODE_BLOCKS))
 
 
-def _controlled_cells(cells: AgentReturns, scales: CellScales) -> list[ResultCell]:
-    return [cell for cell in cells_with_headroom(scales) if cell in cells] or [*cells]
+def _controlled_cells(cells: AgentReturns, scales: CellScales) -> dict[str, list[ResultCell]]:
+    """Return the cells over which M and P are averaged, by `PUBLISHED` and `PREFERENCE`, if the agent played any."""
+    found = {}
+    for where, kind in ((PUBLISHED, "test"), (PREFERENCE, PREFERENCE)):
+        known = cells_with_headroom(scales, PREFERENCE if where == PREFERENCE else None)
+        found[where] = [cell for cell in known if cell in cells] or [cell for cell in cells if cell.kind == kind]
+    return {where: own for where, own in found.items() if own}
 
 
 def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, str]:
@@ -342,11 +361,12 @@ def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, s
     found = {}
     for agent in agents:
         cells, cleared, texts = results.get(agent, {}), controls.get(agent, {}), []
-        for track in TRACKS:
+        for track in ALL_TRACKS:
             score = find_score(cells, cells_with_headroom(scales, track), scales)
             texts.append(f"N {_format_interval(score and score.total)} on track {track}")
-        memory = block_difference(cells, cleared, _controlled_cells(cells, scales), "all")
-        texts.append(f"M {_format_interval(memory, 1, '+')}")
+        for where, own in _controlled_cells(cells, scales).items():
+            memory, on = block_difference(cells, cleared, own, "all"), " on preference" * (where == PREFERENCE)
+            texts.append(f"M {_format_interval(memory, 1, '+')}{on}")
         found[agent] = ", ".join(texts)
     return found
 

@@ -153,9 +153,10 @@ def add_scales(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def cells_with_headroom(scales: CellScales, track: str | None = None) -> list[ResultCell]:
-    """Return the test cells with headroom, optionally only those of a track, in the paper's order."""
-    cells = sorted_cells(cell for cell, scale in scales.items() if scale.has_headroom and cell.kind == "test")
-    return [cell for cell in cells if track is None or cell.layout in TRACKS[track]["test"]]
+    """Return the test cells with headroom of a track, by default of both published tracks, in the paper's order."""
+    kind = PREFERENCE if track == PREFERENCE else "test"
+    cells = sorted_cells(cell for cell, scale in scales.items() if scale.has_headroom and cell.kind == kind)
+    return [cell for cell in cells if track in (None, PREFERENCE) or cell.layout in TRACKS[track]["test"]]
 
 
 def known_headroom(protocol: str) -> dict[ResultCell, bool]:
@@ -195,11 +196,10 @@ def find_score(returns: AgentReturns, cells: Sequence[ResultCell], scales: CellS
     """
     if not cells or not all(is_scored(returns.get(cell), scales.get(cell)) for cell in cells):
         return None
-    groups: dict[str, list[Stratum]] = defaultdict(list)
-    values, labels, regrets = [], [], []
+    parts, values, labels, regrets = [], [], [], []
     for cell in cells:
         gains, spans, names = _gains_and_scales(returns[cell], scales[cell])
-        groups[cell.layout].append(stratum_of_behaviours(gains, spans, names))
+        parts.append((gains, spans, names))
         regrets.append(spans - gains.mean(axis=(0, 2)))
         of_cell = []
         for name in dict.fromkeys(names):
@@ -211,7 +211,7 @@ def find_score(returns: AgentReturns, cells: Sequence[ResultCell], scales: CellS
             labels.append(f"{cell.layout} {cell.family}")
     worst, label = min((of_cell.min(), label) for of_cell, label in zip(values, labels, strict=True))
     return Score(
-        total=ratio_interval([*groups.values()]),
+        total=ratio_interval(_strata_by_layout(cells, parts)),
         middle=interquartile_mean(*values),
         worst=(label, float(worst)),
         regret=float(np.concatenate(regrets).mean()),
@@ -235,8 +235,41 @@ def _gains_and_scales(returns: CellReturns, scale: CellScale) -> tuple[np.ndarra
     return returns.blocks["all"][:, known] - stays[:, None], bests - stays, [one.behaviour for one in of_task]
 
 
+def _pooled_strata(
+    cells: Sequence[ResultCell], parts: Sequence[tuple[np.ndarray, np.ndarray, list[str]]]
+) -> dict[tuple[str, str], Stratum]:
+    """Return (layout, family) -> stratum of behaviours; family is empty for the track `preference`.
+
+    On this track, a cell has one or two tasks, so all tasks of a layout form one stratum.
+
+    Args:
+        cells: result cells.
+        parts: for each cell, the arguments of `stratum_of_behaviours`.
+    """
+    pooled = defaultdict(list)
+    for cell, part in zip(cells, parts, strict=True):
+        pooled[cell.layout, "" if cell.kind == PREFERENCE else cell.family].append(part)
+    return {
+        key: stratum_of_behaviours(
+            np.concatenate([values for values, _, _ in own], axis=1),
+            np.concatenate([scales for _, scales, _ in own]),
+            [name for _, _, names in own for name in names],
+        )
+        for key, own in pooled.items()
+    }
+
+
+def _strata_by_layout(
+    cells: Sequence[ResultCell], parts: Sequence[tuple[np.ndarray, np.ndarray, list[str]]]
+) -> list[list[Stratum]]:
+    groups: dict[str, list[Stratum]] = defaultdict(list)
+    for (layout, _), stratum in _pooled_strata(cells, parts).items():
+        groups[layout].append(stratum)
+    return [*groups.values()]
+
+
 def stratum_of_behaviours(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
-    """Return a stratum for the bootstrap, with behaviours as units, or seeds if there is a single behaviour.
+    """Return a stratum for the bootstrap, with behaviours as units, or seeds if fewer than two behaviours have a scale.
 
     Args:
         values: numerators of the tasks, of shape (T, U, S).
@@ -244,7 +277,8 @@ def stratum_of_behaviours(values: np.ndarray, scales: np.ndarray, behaviours: Se
         behaviours: name of the teammate's behaviour in each task.
     """
     names, seeds = list(dict.fromkeys(behaviours)), values.shape[2]
-    if len(names) == 1:
+    # A resample of behaviours without the only one with a scale would have a denominator of about 0.
+    if len({name for name, scale in zip(behaviours, scales, strict=True) if scale > 0.1 * scales.mean()}) < 2:
         return Stratum(values.sum(axis=1) / seeds, np.full(seeds, scales.sum() / seeds))
     member = np.array([[name == own for name in names] for own in behaviours], float)
     return Stratum(np.moveaxis(values.mean(axis=2)[..., None] * member, 1, -1).sum(axis=-1), scales @ member)
@@ -254,17 +288,19 @@ def score_difference(
     one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], scales: CellScales
 ) -> MeanInterval:
     """Return the score of one agent minus that of another, paired by task, seed and training run."""
-    groups: dict[str, list[Stratum]] = defaultdict(list)
+    parts = []
     for cell in cells:
         first, second = (_gains_and_scales(of, scales[cell]) for of in common_results(one[cell], other[cell]))
-        groups[cell.layout].append(stratum_of_behaviours(first[0] - second[0], *first[1:]))
-    return ratio_interval([*groups.values()])
+        parts.append((first[0] - second[0], *first[1:]))
+    return ratio_interval(_strata_by_layout(cells, parts))
 
 
 def block_difference(
     one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], block: str
 ) -> MeanInterval | None:
     """Return the mean difference of two agents' returns over result cells, paired by task, seed and training run.
+
+    On the track `preference`, it is the mean over layouts.
 
     Args:
         one: results of the first agent.
@@ -275,14 +311,14 @@ def block_difference(
     Returns:
         The difference; None if the agents have no cell in common, or one of them has no such block.
     """
-    groups, alike = [], behaviour_names()
-    for cell in (cell for cell in cells if cell in one and cell in other):
+    parts, alike, common = [], behaviour_names(), [cell for cell in cells if cell in one and cell in other]
+    for cell in common:
         first, second = common_results(one[cell], other[cell])
         if block not in first.blocks or block not in second.blocks:
             return None
         names = [alike.get(task, task) for task in first.tasks]
-        groups.append([stratum_of_behaviours(first.blocks[block] - second.blocks[block], np.ones(len(names)), names)])
-    return ratio_interval(groups) if groups else None
+        parts.append((first.blocks[block] - second.blocks[block], np.ones(len(names)), names))
+    return ratio_interval([[one] for one in _pooled_strata(common, parts).values()]) if parts else None
 
 
 def common_results(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:

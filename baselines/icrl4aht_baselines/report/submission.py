@@ -19,12 +19,13 @@ from msgspec import Meta
 
 from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import AGENTS, OTHER_WAYS
-from icrl4aht_baselines.evaluate.protocols import CONTROLS, bundled_tasks, get_protocol
+from icrl4aht_baselines.evaluate.protocols import CONTROLS, bundled_tasks, get_protocol, plan_tasks
 from icrl4aht_baselines.evaluate.results import RESULTS
 from icrl4aht_baselines.report.results import find_training_record, read_results
 from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_data.benchmark.best_responses import read_best_responses
-from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, TRACKS
+from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import write_atomically
 from icrl4aht_data.utils.text import counted_noun
@@ -70,12 +71,14 @@ class Evaluation(msgspec.Struct, forbid_unknown_fields=True):
         training: number of the agent's training run, if there are several with different seeds.
         settings: settings of the results, see `evaluate.results.Result`; the details state `trained_on`.
         returns: task id -> return of each episode, as one list per seed.
+        partners: task id -> the result's `partners`; for the control `swapped` only.
     """
 
     control: str
     training: Annotated[int, Meta(ge=0)]
     settings: dict[str, Any]
     returns: dict[str, list[list[float]]]
+    partners: dict[str, list[str]] = {}
 
 
 class Submission(msgspec.Struct, forbid_unknown_fields=True):
@@ -88,15 +91,15 @@ class Submission(msgspec.Struct, forbid_unknown_fields=True):
         best_responses: version of the best responses, see `benchmark.best_responses`.
         tracks: names of the evaluated tracks.
         evaluations: results of the agent.
-        update: whether the agent is already on the page. Main results replace all stored results of the agent; without
-            main results, controls and other play modes are added to the stored results.
+        update: whether the agent is already on the page. Main results replace all stored results of the agent on the
+            same layouts; without main results, controls and other play modes are added to the stored results.
     """
 
     format: Literal[1]
     agent: Annotated[str, Meta(pattern=_NAME)]
     facts: AgentFacts
     best_responses: str
-    tracks: list[Literal["teammate", "layout"]]
+    tracks: list[Literal["teammate", "layout", "preference"]]
     evaluations: Annotated[list[Evaluation], Meta(min_length=1)]
     update: bool = False
 
@@ -136,16 +139,18 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
                 counts.update((way, result.task_id) for result in results)
             returns = {result.task_id: result.returns for result in results}
             tasks |= set() if control else returns.keys()
-            evaluations.append(Evaluation(control or way, training, settings, returns))
-    tracks: Any = [track for track in TRACKS if tasks & _track_tasks([track])] or [*TRACKS]
+            partners = {result.task_id: result.partners for result in results if result.partners}
+            evaluations.append(Evaluation(control or way, training, settings, returns, partners))
+    tracks: Any = [track for track in ALL_TRACKS if tasks & track_tasks([track]).keys()] or [*TRACKS]
     name = agent or evaluations[0].settings["agent"].removesuffix(f" ({evaluations[0].control})")
     found = Submission(1, name, facts, read_best_responses().version, tracks, evaluations, update)
     check_submission(found, ", ".join(map(str, folders)))
     return found
 
 
-def _track_tasks(tracks: Iterable[str]) -> set[str]:
-    return {task.task_id for track in tracks for task in bundled_tasks(track, "test")}
+def track_tasks(tracks: Iterable[str]) -> dict[str, Task]:
+    """Return the test tasks of some tracks by task id."""
+    return {task.task_id: task for track in tracks for task in bundled_tasks(track, "test")}
 
 
 def check_submission(found: Submission, where: str) -> None:
@@ -154,7 +159,8 @@ def check_submission(found: Submission, where: str) -> None:
     Raises:
         OptionError: if the agent's name is taken by another agent or cannot be shown in tables, the best responses
             have another version, the training data is not stated, protocol, seeds or episodes are not those of the
-            page, or the tasks are not exactly those of the tracks.
+            page, the tasks are not exactly those of the tracks, or the control `swapped` has other teammates than for
+            all tasks of a track.
     """
     _check_name(found, where)
     known = read_best_responses().version
@@ -163,14 +169,22 @@ def check_submission(found: Submission, where: str) -> None:
             f"{where}: made with best responses {found.best_responses!r}, but this package has {known!r}; make the "
             f"file again with `icrl4aht-data submit`"
         )
+    expected = track_tasks(found.tracks)
+    swapped = plan_tasks([*expected.values()], get_protocol(SUBMITTED_PROTOCOL), "swapped")
+    partners = {plan.task.task_id: [*plan.partners] for plan in swapped}
     played: dict[tuple[str, int], list[str]] = defaultdict(list)
     for one in found.evaluations:
         part = f"{where}: {one.control or found.agent}, training {one.training}"
         if one.control not in ("", *CONTROLS, *OTHER_WAYS):
             raise OptionError(f"{part}: control {one.control!r}, expected {' or '.join((*CONTROLS, *OTHER_WAYS))}")
         _check_evaluation(one, part)
+        for task in one.returns if one.control == "swapped" else ():
+            if one.partners.get(task) != partners.get(task, one.partners.get(task)):
+                raise OptionError(
+                    f"{part}: task {task} has the teammates of {one.partners.get(task)}, expected those of "
+                    f"{partners[task]}; evaluate all tasks of the track with one command"
+                )
         played[one.control, one.training] += one.returns
-    expected = _track_tasks(found.tracks)
     named = f"the {counted_noun(len(expected), 'test task')} of {' and '.join(found.tracks)}"
     for (control, training), tasks in played.items():
         part = f"{where}: {control or found.agent}, training {training}"

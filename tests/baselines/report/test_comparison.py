@@ -17,10 +17,11 @@ from msgspec import structs
 
 from icrl4aht_data.benchmark import best_responses
 from icrl4aht_data.benchmark.adaptation import published_adaptation_table
+from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.benchmark.reference_returns import read_reference_returns
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.text import card_file
-from tests.helpers.evaluated import write_results
+from tests.helpers.evaluated import write_invented_responses, write_results
 from tests.helpers.paths import ROOT
 
 FACTS = AgentFacts("a rule", "noise", "oracle", steps="10 updates", core_hours=2.0)
@@ -93,18 +94,42 @@ def test_p_values_are_corrected_over_all_effects(stored, invented_responses):
     """The five effects are N of both agents and their difference on track `layout`, and M and P of `high`."""
     found = effects(stored)
     assert {*found} == {
-        ("high", "layout"), ("low", "layout"), ("layout", "high", "low"), ("high", "cleared"), ("high", "swapped"),
+        ("N", "layout", "high"), ("N", "layout", "low"), ("difference", "layout", "high", "low"),
+        ("cleared", "published", "high"), ("swapped", "published", "high"),
     }  # fmt: skip
     assert {key: of.p for key, of in found.items()} == holm_corrected({key: of.effect.p for key, of in found.items()})
-    assert found["high", "cleared"].p >= 4 * found["high", "cleared"].effect.p
+    memory = found["cleared", "published", "high"]
+    assert memory.p >= 4 * memory.effect.p
 
 
 def test_controls_table_has_memory_and_partner_controls_and_episode_blocks(stored, invented_responses):
     table = comparison.controls_table(stored.returns(), cell_scales("seeded"), effects(stored))
     high, low = agent_row(table, "high"), agent_row(table, "low")
-    assert high[1].startswith("**+15.5 (") and high[1].endswith(")**"), "19.5 + 2 - (5 + 1)"
-    assert high[2] == "+0.0 (+0.0 to +0.0)" and high[3:] == ["12.0", "12.0", "22.0", "22.0"]
-    assert low[1:] == ["–", "–", "0.0", "0.0", "10.0", "10.0"]
+    assert high[1] == low[1] == "published"
+    assert high[2].startswith("**+15.5 (") and high[2].endswith(")**"), "19.5 + 2 - (5 + 1)"
+    assert high[3] == "+0.0 (+0.0 to +0.0)" and high[4:] == ["12.0", "12.0", "22.0", "22.0"]
+    assert low[2:] == ["–", "–", "0.0", "0.0", "10.0", "10.0"]
+
+
+def test_results_on_track_preference_have_their_own_columns_and_rows(stored, tmp_path, monkeypatch):
+    """They are added to the agent's results on other tracks; without best responses there is no score."""
+    monkeypatch.setattr(best_responses, "best_responses_file", lambda: tmp_path / "both.json")
+    write_invented_responses(tmp_path / "both.json", preference=True)
+    write_results(tmp_path / "high", "high", [12.0] * 100, PREFERENCE)
+    write_results(tmp_path / "high" / "cleared", "high (cleared)", [5.0] * 100, PREFERENCE, forget=True)
+    more = comparison.add_submission(stored, make_submission([tmp_path / "high"], FACTS, update=True))
+    assert len(more.table) == len(stored.table) + 2 * 120 * 3 * 6, "results on the track layout are kept"
+    scales, found = cell_scales("seeded"), effects(more)
+    assert len([cell for cell in scales if cell.kind == PREFERENCE]) == len({(cell.layout, cell.family)
+               for cell in more.returns()["high"] if cell.kind == PREFERENCE})  # fmt: skip
+    table = comparison.agents_table(more, more.returns(), scales, found)
+    assert "| N, layout | IQM, layout | N, preference | IQM, preference |" in table
+    high, low = agent_row(table, "high"), agent_row(table, "low")
+    assert high[8].startswith("**0.51 (") and low[8:] == ["–", "–"]
+    assert high[:8] == agent_row(comparison.agents_table(stored, stored.returns(), scales, found), "high")[:8]
+    lines = comparison.controls_table(more.returns(), scales, found).splitlines()
+    rows = [line for line in lines if PREFERENCE in line]
+    assert len(rows) == 1 and rows[0].startswith("| `high` | preference | **+7.0 (+7.0 to +7.0)** | – | 12.0 |")
 
 
 def test_layouts_table_has_reference_egos_and_returns_by_layout(stored, invented_responses):

@@ -91,6 +91,21 @@ def test_incomplete_or_invalid_submission_raises_error(submission_file, tmp_path
     assert str(caught.value).startswith(str(tmp_path / "bad.json"))
 
 
+def test_control_swapped_needs_the_teammates_of_the_complete_track(tmp_path):
+    """Teammates that play first depend on the tasks that were evaluated together."""
+    write_results(tmp_path / "mine", "rule", CURVE)
+    write_results(tmp_path / "mine" / "swapped", "rule (swapped)", CURVE, swapped=True)
+    found = make_submission([tmp_path / "mine"], FACTS)
+    assert [len(one.partners) for one in found.evaluations] == [0, 40]
+    path = sorted((tmp_path / "mine" / "swapped" / "tasks").iterdir())[0]
+    result = read_result(path)
+    path.write_text(json.dumps(replace(result, partners=[result.task_id] * 2).to_json()))
+    with pytest.raises(
+        OptionError, match=f"has the teammates of .*{result.task_id}.*; evaluate all tasks of the track"
+    ):
+        make_submission([tmp_path / "mine"], FACTS)
+
+
 def test_results_that_cannot_be_submitted_raise_errors(tmp_path):
     with pytest.raises(OptionError, match=f"{tmp_path}/none: no results in"):
         make_submission([tmp_path / "none"], FACTS)
