@@ -30,7 +30,7 @@ from icrl4aht_data.benchmark.best_responses import BestResponse, TrainingRun
 from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write, json_hash, write_json
+from icrl4aht_data.utils.files import atomic_write, json_hash, write_atomically, write_json
 from icrl4aht_data.utils.groups import grouped
 
 MEASURED_EPISODES = 100
@@ -208,8 +208,7 @@ def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
             known[title] = entry
     with atomic_write(path) as partial:
         write_json(partial, list(known.values()))
-    with atomic_write(path.with_suffix(".md")) as partial:
-        partial.write_text(f"# Adaptation headroom\n\n{adaptation_table(known.values())}\n", encoding="utf-8")
+    write_atomically(path.with_suffix(".md"), f"# Adaptation headroom\n\n{adaptation_table(known.values())}\n")
     return path
 
 

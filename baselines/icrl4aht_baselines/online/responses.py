@@ -45,7 +45,7 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS, LAYOUT_NAMES, LEAST_HEADRO
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_reference_returns
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import unknown_name
-from icrl4aht_data.utils.files import json_hash, parse_json, read_text
+from icrl4aht_data.utils.files import json_hash, parse_json, read_text, write_atomically
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import markdown_table
 
@@ -345,13 +345,15 @@ def add_responses(found: Sequence[BestResponse], folder: Path, models: Mapping[s
     """Add best responses to the file `RESPONSES_FILE` in a folder. Return the file's path.
 
     Earlier entries that share tasks with the new ones are removed. For all entries, `include_models` chooses between
-    trained egos and stored models. The version in the file is a hash of all entries.
+    trained egos and stored models. The version in the file is a hash of all entries. A table of all entries is written
+    beside the file.
     """
     new, path = {task for one in found for task in one.tasks}, folder / RESPONSES_FILE
     kept = [one for one in _stored_responses(folder) if new.isdisjoint(one.tasks)]
     behaviours = tuple(include_models(one, models) for one in (*kept, *found))
     card = BestResponseCard(json_hash(to_builtins(behaviours)), PROTOCOL, ABOUT, behaviours)
     write_best_responses(path, card)
+    write_atomically(path.with_suffix(".md"), f"# Best responses\n\n{responses_table(folder)}\n")
     return path
 
 

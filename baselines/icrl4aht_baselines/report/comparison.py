@@ -236,6 +236,9 @@ def render_comparison(stored: StoredResults) -> str:
     measured, scored = read_best_responses(), cells_with_headroom(scales)
     shown = stored.with_other_play_modes(results)
     effects = secondary_effects(stored, results, scales)
+    flat = [
+        f"{cell.layout} {cell.family}" for cell in sorted_cells(scales) if cell.kind == "test" and cell not in scored
+    ]
     one_way = [f"`{agent}`" for agent in results if not any(f"{agent} ({way})" in shown for way in OTHER_WAYS)]
     return fill_template(
         "results.md",
@@ -250,6 +253,7 @@ def render_comparison(stored: StoredResults) -> str:
         measured=f"{measured.about.rstrip('.')} (version {measured.version}).",
         cells=f"{len(scored)} of {sum(cell.kind == 'test' for cell in scales)} cells",
         scored=", ".join(dict.fromkeys(cell.layout for cell in scored)) or "none",
+        without=f". Without headroom: {', '.join(flat)}" if flat else "",
         alpha=f"{_SIGNIFICANT:g}",
         rows=f"{len(stored.table):,}",
     )
@@ -450,7 +454,7 @@ def describe_training_runs() -> str:
     return (
         f"For each of {len(behaviours)} behaviours a best response was trained in {runs} "
         f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. For {models} of them a stored "
-        f"model earns more."
+        f"model was chosen instead."
     )
 
 
