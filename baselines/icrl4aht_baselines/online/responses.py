@@ -368,7 +368,12 @@ def responses_table(folder: Path) -> str:
         returns, best = [seed.mean_return for seed in one.seeds], best_training_run(one.seeds)
         numbers = ", ".join(task.rsplit("_", 3)[1] for task in one.tasks)
         spread = f"{min(returns):.1f} to {max(returns):.1f}" if len(returns) > 1 else ""
-        training = [str(len(returns)), f"{best.steps:,}", str(best.width), f"{best.slope or 0.0:+.1f}"]
+        training = [
+            str(len(returns)),
+            f"{best.steps:,}",
+            str(best.width),
+            "" if best.slope is None else f"{best.slope:+.1f}",
+        ]
         body.append([one.layout, one.split, f"{one.family} {numbers}", f"{one.best:.1f}", one.agent, spread, *training])
     header = ["layout", "split", "teammates", "B", "of", "trainings", "number", "steps", "width", "rise"]
     return markdown_table(header, body)
