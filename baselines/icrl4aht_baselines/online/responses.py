@@ -59,13 +59,11 @@ RESPONSES_FILE = "best_responses.json"
 """Name of the file of best responses, in a folder of training runs and among the package's cards."""
 
 ABOUT = (
-    "Best responses are recurrent PPO agents with the benchmark's 5 x 5 view. Each is trained with one teammate, with "
-    "memory cleared before each episode, and imitates the oracle in the first half of the training. Episodes of seed "
-    f"{CHOICE_SEEDS[0]} decide which training run is used. Returns are means over the tasks and the seeds "
+    "Best responses are recurrent PPO agents with the benchmark's view. Each is trained with one teammate, with memory "
+    "cleared before each episode, and imitates the oracle in the first half of the training. Episodes of seed "
+    f"{CHOICE_SEEDS[0]} decide between training runs. Returns are means over tasks and the seeds "
     f"{', '.join(map(str, REPORT_SEEDS))}. For each of these seeds, the stored model that earns most with the other "
-    f"two is used instead if it earns more with them than the training run with seed {CHOICE_SEEDS[0]}. On the track "
-    "`preference`, best responses are informed egos, which are trained with all tasks of a layout and observe the "
-    "task's number."
+    "two is used instead if it earns more with them. On the track `preference`, best responses are informed egos."
 )
 
 PLAY = PlayOptions(task_end=1.0)

@@ -43,7 +43,7 @@ from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts,
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.adaptation import published_adaptation_table
 from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE, TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_reference_returns
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import add_legend_below, average_in_blocks, axis_limits, save_figure
@@ -81,9 +81,9 @@ class SecondaryEffect(NamedTuple):
 SecondaryEffects = Mapping[tuple[str, ...], SecondaryEffect]
 """All effects that the page tests besides the primary endpoint. Keys: ("N", track, agent), ("difference", track,
 agent, other agent) for differences of N, ("cleared", where, agent) for M, and ("swapped", where, agent) for P; `where`
-is `PUBLISHED` or `PREFERENCE`."""
+is `PUBLISHED_TRACKS` or `PREFERENCE`."""
 
-PUBLISHED = "published"
+PUBLISHED_TRACKS = "published"
 """Name for both published tracks together, over which M and P are averaged."""
 
 
@@ -313,9 +313,9 @@ def agents_table(
             score = find_score(cells, cells_with_headroom(scales, track), scales)
             tested = effects.get(("N", track, agent))
             total = tested.text(2, "") if tested else _format_interval(score and score.total)
-            row += [total, _format_interval(score and score.middle)]
+            row += [total] if track == PREFERENCE else [total, _format_interval(score and score.middle)]
         body.append(row)
-    scored = [f"{name}, {track}" for track in ALL_TRACKS for name in ("N", "IQM")]
+    scored = [f"{name}, {track}" for track in TRACKS for name in ("N", "IQM")] + [f"N, {PREFERENCE}"]
     return markdown_table(["model", "data", "labels", "budget", *scored], body)
 
 
@@ -336,7 +336,7 @@ def controls_table(results: Mapping[str, AgentReturns], scales: CellScales, effe
     it played if none of them has headroom, separately for the published tracks and the track `preference`.
     """
     body = []
-    for where in (PUBLISHED, PREFERENCE):
+    for where in (PUBLISHED_TRACKS, PREFERENCE):
         for agent, cells in results.items():
             played = [cells[cell].blocks for cell in _controlled_cells(cells, scales).get(where, ())]
             if not played:
@@ -351,9 +351,9 @@ def controls_table(results: Mapping[str, AgentReturns], scales: CellScales, effe
 
 
 def _controlled_cells(cells: AgentReturns, scales: CellScales) -> dict[str, list[ResultCell]]:
-    """Return the cells over which M and P are averaged, by `PUBLISHED` and `PREFERENCE`, if the agent played any."""
+    """Return the cells over which M and P are averaged, by `PUBLISHED_TRACKS` and `PREFERENCE`, if any were played."""
     found = {}
-    for where, kind in ((PUBLISHED, "test"), (PREFERENCE, PREFERENCE)):
+    for where, kind in ((PUBLISHED_TRACKS, "test"), (PREFERENCE, PREFERENCE)):
         known = cells_with_headroom(scales, PREFERENCE if where == PREFERENCE else None)
         found[where] = [cell for cell in known if cell in cells] or [cell for cell in cells if cell.kind == kind]
     return {where: own for where, own in found.items() if own}
