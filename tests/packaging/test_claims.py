@@ -6,6 +6,7 @@ For numbers that take long to compute, the text names the command that prints th
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -25,9 +26,10 @@ from icrl4aht_generation.layouts.families import LAYOUT_SPLITS
 from icrl4aht_generation.layouts.rooms import MOST_COLUMNS, MOST_ROWS
 from icrl4aht_generation.learners.checkpoint import POLICY_CHECKPOINTS
 from icrl4aht_generation.profiles import load_profile
-from icrl4aht_generation.teammates.draws import DRAWS_PER_SEED
+from icrl4aht_generation.teammates.draws import DRAWS_PER_SEED, find_draw
 from icrl4aht_generation.teammates.heuristics.territory import TERRITORY
 from icrl4aht_generation.teammates.instances import INSTANCES
+from icrl4aht_generation.teammates.preference import preference_tasks
 
 from icrl4aht_data.benchmark.adaptation import EGO_KINDS, headroom_text, published_adaptation, read_adaptation
 from icrl4aht_data.benchmark.facts import (
@@ -144,6 +146,28 @@ def adaptation_headroom() -> tuple[float, ...]:
     return min(of[0]), max(of[0]), len(of[0]), min(of[1]), max(of[1]), len(of[1])
 
 
+def proof_returns() -> tuple[float, ...]:
+    """Return the number of tasks, and returns of AD on `search` histories in episodes 1 and 6 to 20, also cleared."""
+    proof = json.loads((ROOT / "cards" / "proof.json").read_text(encoding="utf-8"))
+    (model,) = [one for one in proof["models"] if (one["histories"], one["learner"]) == ("search", "AD, expert labels")]
+    assert len(model["seeds"]) == 3
+    return proof["tasks"]["preference"], *(fmean(model[name]) for name in ("first", "late", "late_cleared"))
+
+
+def training_teammates_like_tests() -> tuple[int, ...]:
+    """Return the numbers of training tasks of `preference` whose teammate acts like a test instance, and of all tasks.
+
+    Distances are measured on test_wide and asymm_both, with their indicators.
+    """
+    found = []
+    for layout in ("test_wide", "asymm_both"):
+        tasks = [task for task in preference_tasks("train") if task.layout.name == f"{layout}_plain"]
+        draws = [one for task in tasks if (one := find_draw(layout, task.teammate))]
+        assert len(draws) == len(tasks)
+        found += [sum(min(one.distance, one.other_distance) < SAME_BEHAVIOUR for one in draws), len(tasks)]
+    return tuple(found)
+
+
 def gain_of_best_responses() -> float:
     """Return the mean best response on asymm_right minus the informed ego's return."""
     informed = published_adaptation()["asymm_right"]["returns"]["informed"]
@@ -168,6 +192,16 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
         adaptation_headroom,
     ),
     ("docs/protocol", "best responses earn {} more than the informed ego", gain_of_best_responses),
+    (
+        "docs/preference",
+        "return on the {} validation .. was {} in episode 1 and {} in .. and {} in these",
+        proof_returns,
+    ),
+    (
+        "docs/preference",
+        "test_wide {} of the {} training tasks .. on asymm_both {} of {}.",
+        training_teammates_like_tests,
+    ),
     ("docs/index", "{} test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/evaluating", "{} published test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/protocol", "plays {} episodes of {} steps", lambda: (SEEDED.episodes, SEEDED.steps)),
