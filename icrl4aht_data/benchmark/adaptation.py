@@ -36,7 +36,7 @@ def read_adaptation(folder: Path) -> list[dict[str, Any]]:
 
 
 def task_set_name(track: str, split: str, layout: str, families: Iterable[str] = ()) -> str:
-    """Return the name of a set of tasks in entries; `layout` is "all" if one ego plays all layouts."""
+    """Return the name of a set of tasks on a layout, for entries."""
     return "-".join((track, split, layout, *families))
 
 
@@ -66,28 +66,21 @@ def headroom_text(entry: Mapping[str, Any]) -> str:
     return f"{informed - episodic:+z.1f}{interval}"
 
 
-def adaptation_table(entries: Iterable[Mapping[str, Any]], layouts: bool = True) -> str:
+def adaptation_table(entries: Iterable[Mapping[str, Any]]) -> str:
     """Return a Markdown table of measured sets of tasks: mean returns of egos and scripts, and the difference.
 
     Columns of scripts are left out if no set has their returns.
 
     Args:
         entries: entries of a file `ADAPTATION`.
-        layouts: whether a set of several layouts also gets a row for each layout.
     """
     entries, rows = list(entries), []
     scripts = [name for name in SCRIPTS if any("scripts" in entry for entry in entries)]
-
-    def texts(returns: Mapping[str, float], names: Iterable[str]) -> list[str]:
-        return [f"{returns[name]:z.1f}" if name in returns else "" for name in names]
-
     for entry in entries:
-        means = [*texts(entry.get("scripts", {}), scripts), *(f"{mean:z.1f}" for mean in _mean_returns(entry))]
+        earned = [f"{entry['scripts'][name]:z.1f}" if "scripts" in entry else "" for name in scripts]
+        means = [f"{mean:z.1f}" for mean in _mean_returns(entry)]
         training = [str(len(entry["returns"]["informed"])), f"{entry['steps']:,}", str(entry["width"])]
-        rows.append([entry["tasks"], str(entry["number"]), *means, headroom_text(entry), *training])
-        for layout, of in entry["layouts"].items() if layouts and len(entry["layouts"]) > 1 else ():
-            difference = f"{of['informed'] - of['episodic']:+z.1f}"
-            rows.append([layout, "", *texts(of, (*scripts, *EGO_KINDS)), difference, "", "", ""])
+        rows.append([entry["tasks"], str(entry["number"]), *earned, *means, headroom_text(entry), *training])
     header = ["set", "tasks", *scripts, *EGO_KINDS, "difference", "seeds", "steps of each", "width"]
     return markdown_table(header, rows, right=len(header) - 1)
 

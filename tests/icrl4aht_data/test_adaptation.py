@@ -19,9 +19,8 @@ from icrl4aht_data.writing.card import card_facts, render_card
 
 def make_entry(tasks: str, informed: float, episodic: float, interval: list[float] | None = None) -> dict:
     returns = {"informed": {"0": informed}, "episodic": {"0": episodic}}
-    layouts = {"demo_wide": {"informed": informed, "episodic": episodic}}
     sizes = {"number": 20, "steps": 8_000, "width": 64}
-    return {"tasks": tasks, **sizes, "returns": returns, "interval": interval, "layouts": layouts}
+    return {"tasks": tasks, **sizes, "returns": returns, "interval": interval}
 
 
 ENTRY = make_entry("teammate-test-demo_wide", 10.0, 12.0, [-3.0, -1.0])
@@ -61,29 +60,12 @@ def test_difference_has_an_interval_if_there_are_several_seeds():
     assert headroom_text(make_entry("all", 1.0, 1.04)) == "+0.0"
 
 
-def test_table_has_a_row_for_each_layout_of_a_set():
-    both = make_entry("all", 3.0, 1.0)
-    both["layouts"]["test_wide"] = {"informed": 0.0, "episodic": 0.5}
-    row = "| all | 20 | 3.0 | 1.0 | +2.0 | 1 | 8,000 | 64 |"
-    assert adaptation_table([both], layouts=False).splitlines()[2:] == [row]
-    assert adaptation_table([both]).splitlines()[2:] == [
-        row,
-        "| demo_wide |  | 3.0 | 1.0 | +2.0 |  |  |  |",
-        "| test_wide |  | 0.0 | 0.5 | -0.5 |  |  |  |",
-    ]
-
-
 def test_table_shows_returns_of_scripts_beside_those_of_egos():
     """Sets without returns of scripts have empty cells, as on published layouts."""
     scripts = {"stay": 0.0, "random": -1.0, "oracle": 40.0, "search": 30.0}
-    both = make_entry("all", 3.0, 1.0) | {"scripts": scripts}
-    both["layouts"]["demo_wide"] |= scripts
-    both["layouts"]["test_wide"] = {"informed": 0.0, "episodic": 0.5, **scripts}
-    header, _, *rows = adaptation_table([both, ENTRY]).splitlines()
+    header, _, *rows = adaptation_table([make_entry("all", 3.0, 1.0) | {"scripts": scripts}, ENTRY]).splitlines()
     assert header.startswith("| set | tasks | stay | random | oracle | search | informed | episodic | difference |")
     assert rows == [
         "| all | 20 | 0.0 | -1.0 | 40.0 | 30.0 | 3.0 | 1.0 | +2.0 | 1 | 8,000 | 64 |",
-        "| demo_wide |  | 0.0 | -1.0 | 40.0 | 30.0 | 3.0 | 1.0 | +2.0 |  |  |  |",
-        "| test_wide |  | 0.0 | -1.0 | 40.0 | 30.0 | 0.0 | 0.5 | -0.5 |  |  |  |",
         "| teammate-test-demo_wide | 20 |  |  |  |  | 10.0 | 12.0 | -2.0 (-3.0 to -1.0) | 1 | 8,000 | 64 |",
     ]

@@ -202,14 +202,9 @@ def best_response_command(
         "icrl4aht-data adaptation-headroom --track preference --workers 2 --bundle",
     ),
 )
-@_ego_options(
-    click.option("--together", is_flag=True, help="One ego for all layouts instead of one for each."),
-    steps=f"{_STEPS:,}",
-)
+@_ego_options(steps=f"{_STEPS:,}")
 @_queue_command("runs/adaptation", "adaptation.json")
-def adaptation_headroom_command(
-    together: bool, seeds: int, training: dict[str, Any], out: Path, **choice: Any
-) -> _Queued:
+def adaptation_headroom_command(seeds: int, training: dict[str, Any], out: Path, **choice: Any) -> _Queued:
     """Estimate how much memory across episodes can raise returns.
 
     Trains two egos on the tasks of each layout. An informed ego observes the task's number in every step; an episodic
@@ -224,8 +219,7 @@ def adaptation_headroom_command(
 
     sets: dict[str, list[Task]] = defaultdict(list)
     for task in shared.chosen_tasks(**choice):
-        where = "all" if together else task.layout.name
-        sets[task_set_name(task.track, task.split, where, choice["families"])].append(task)
+        sets[task_set_name(task.track, task.split, task.layout.name, choice["families"])].append(task)
     jobs = adaptation_jobs(sets, seeds, replace_options(ResponseOptions(_STEPS), training), out)
 
     def write(folder: Path) -> Path:

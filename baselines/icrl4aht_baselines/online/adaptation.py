@@ -154,10 +154,9 @@ def adaptation_jobs(
 def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any] | None:
     """Return the entry of a set of tasks for cards/adaptation.json; None if no seed has finished jobs of both kinds.
 
-    An entry has the training steps, the width of the network, the mean return of each kind of ego for each seed,
-    and the mean return on each layout over these seeds. If there are several seeds, "interval" is a 95 % Student's t
-    interval over the seeds of the difference between the two kinds. If all scripts have played the tasks, "scripts" has
-    their mean returns, and each layout has them as well.
+    An entry has the training steps, the width of the network, and the mean return of each kind of ego for each seed. If
+    there are several seeds, "interval" is a 95 % Student's t interval over the seeds of the difference between the two
+    kinds. If all scripts have played the tasks, "scripts" has their mean returns.
     """
     own = [job for job in jobs if job.title == title and job.kind in EGO_KINDS and job.is_finished()]
     seeds = sorted(set.intersection(*({job.seed for job in own if job.kind == kind} for kind in EGO_KINDS)))
@@ -167,21 +166,17 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
     scripts = {job.kind: job.result()["returns"] for job in jobs if job.kind in SCRIPTS and job.is_finished()}
     if len(scripts) < len(SCRIPTS):
         scripts = {}
-    found |= {(name, 0): returns for name, returns in scripts.items()}
-    layouts = dict.fromkeys(task.layout.name for task in own[0].tasks)
 
-    def mean(kind: str, seeds: Sequence[int], layout: str = "") -> float:
-        ids = [task.task_id for task in own[0].tasks if layout in ("", task.layout.name)]
-        return round(float(np.mean([[found[kind, seed][task] for task in ids] for seed in seeds])), 3)
+    def mean(returns: Mapping[str, float]) -> float:
+        return round(float(np.mean([returns[task.task_id] for task in own[0].tasks])), 3)
 
-    returns = {kind: {str(seed): mean(kind, [seed]) for seed in seeds} for kind in EGO_KINDS}
+    returns = {kind: {str(seed): mean(found[kind, seed]) for seed in seeds} for kind in EGO_KINDS}
     interval = None
     if len(seeds) > 1:
         informed, episodic = (np.array([*returns[kind].values()]) for kind in EGO_KINDS)
         differences = informed - episodic
         half = stats.t.ppf(0.975, len(seeds) - 1) * stats.sem(differences)
         interval = [round(float(differences.mean() + side * half), 3) for side in (-1, 1)]
-    played = dict.fromkeys(EGO_KINDS, seeds) | {name: [0] for name in scripts}
     return {
         "tasks": title,
         "number": len(own[0].tasks),
@@ -189,8 +184,7 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
         "width": own[0].options.width,
         "returns": returns,
         "interval": interval,
-        **({"scripts": {name: mean(name, [0]) for name in scripts}} if scripts else {}),
-        "layouts": {layout: {kind: mean(kind, of, layout) for kind, of in played.items()} for layout in layouts},
+        **({"scripts": {name: mean(of) for name, of in scripts.items()}} if scripts else {}),
     }
 
 
