@@ -114,5 +114,5 @@ def published_table(layouts: HeadroomCells) -> str:
         stated = [np.mean([published_cells(name)[layout][family][0] for family in cells]) for name in paper]
         numbers = [f"{number:z.1f}" for number in (stay, drawn, *stated, oracle)]
         body.append([layout, *numbers, f"{sum(map(has_headroom, cells.values()))} of {len(cells)}"])
-    names = ["stay", "random", *(f"{name} (paper)" for name in paper), "oracle", "cells where oracle gains"]
+    names = ["stay", "random", *(f"{name} (paper)" for name in paper), "oracle", "cells where the oracle earns more"]
     return markdown_table(["layout", *names], body)

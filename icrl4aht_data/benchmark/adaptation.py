@@ -19,8 +19,8 @@ from icrl4aht_data.utils.text import card_file, markdown_table
 EGO_KINDS = ("informed", "episodic")
 
 SCRIPTS = (*REFERENCES, "search")
-"""Reference egos that are measured on the same tasks. On published layouts they are not, because `cards/headroom.json`
-has their returns."""
+"""Reference egos that play the same tasks on the track `preference`. `cards/headroom.json` has returns of the first
+three on published layouts."""
 
 _LAYOUT_TASKS = 20  # number of test tasks on each published layout
 

@@ -1,9 +1,9 @@
-"""Best responses: for each teammate, the highest known return of an ego that sees only its own observations.
+"""Best responses: for each teammate, the return of the best known ego with the benchmark's view.
 
 The file `cards/best_responses.json` stores the best responses. A best response is a recurrent ego that was trained with
 one teammate, or a model of the page of results that earned more than this ego in the episodes used to choose between
-them. On the track `preference` it is the informed ego of `icrl4aht_data.benchmark.adaptation`. Tasks whose teammates
-behave the same share a best response.
+them. On the track `preference` it is an informed ego, which also observes the task's number, see
+`icrl4aht_data.benchmark.adaptation`. Tasks whose teammates behave the same share a best response.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ class TrainingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         width: number of features and of recurrent units of the ego's network.
         mean_return: mean return per episode of the trained ego; stored as `return` in the file.
         choice: mean return in the episodes that decide which training run is the best.
-        acting: "greedy" or "sampled" actions, whichever earned more in the episodes of `choice`.
+        acting: "greedy" or "sampled" actions, whichever earned more in the episodes of `choice`; "sampled" for
+            informed egos.
         slope: rise of the mean return from the third to the last quarter of the steps of the training run.
         init: name of the bundled model that the training run started from; empty for random parameters.
         tasks: number of tasks of the training run. If there are several, the ego is an informed ego, see
@@ -57,7 +58,7 @@ class BestResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         split: split of the tasks.
         tasks: ids of the tasks whose teammates show this behaviour.
         seeds: training runs of egos with a teammate of this behaviour.
-        best: mean return of the best ego that sees only its own observations; the ego is chosen by other episodes.
+        best: mean return of the best ego, which is chosen by other episodes.
         agent: name of the ego with the highest mean return over all seeds, such as "best response, seed 1".
     """
 
@@ -87,8 +88,11 @@ class BestResponseCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def best_training_run(trainings: Iterable[TrainingRun]) -> TrainingRun:
-    """Return the training run with the highest `choice`, the mean return in the episodes that decide between runs."""
-    return max(trainings, key=lambda one: -math.inf if one.choice is None else one.choice)
+    """Return the training run with the highest `choice`, the mean return in the episodes that decide between runs.
+
+    Of runs without `choice`, the first of those with the most steps is returned.
+    """
+    return max(trainings, key=lambda one: (-math.inf, one.steps) if one.choice is None else (one.choice, 0))
 
 
 def best_responses_file() -> Path:

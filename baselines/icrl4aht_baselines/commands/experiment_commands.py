@@ -14,7 +14,7 @@ from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_baselines.training.options import ResponseOptions
-from icrl4aht_data.benchmark.facts import SOURCES
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, SOURCES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
 from icrl4aht_data.commands.options import COUNT, Folder, Names, examples
@@ -130,9 +130,10 @@ def _model_returns() -> dict[str, dict[str, Any]]:
     """
     from icrl4aht_baselines.online.responses import REPORT_SEEDS
     from icrl4aht_baselines.report.comparison import read_stored, results_file
-    from icrl4aht_baselines.report.results import bundled_tasks_by_id, task_label
+    from icrl4aht_baselines.report.results import task_label
+    from icrl4aht_baselines.report.submission import track_tasks
 
-    ids, stored = {task_label(task): task for task in bundled_tasks_by_id("test")}, read_stored(results_file())
+    ids, stored = {task_label(task): task for task in track_tasks(ALL_TRACKS)}, read_stored(results_file())
     return {
         agent: {
             ids[task]: values
@@ -210,8 +211,9 @@ def adaptation_headroom_command(seeds: int, training: dict[str, Any], out: Path,
     Trains two egos on the tasks of each layout. An informed ego observes the task's number in every step; an episodic
     ego has to identify the teammate in each episode. Prints the difference of their returns, with an interval over the
     seeds. The difference is an estimate, because both egos are trained for --steps only. Writes OUT/adaptation.json.
-    Finished training runs are reused, and stopped runs resume. On the track `preference` each teammate on a layout
-    wants each dish, scripts play the same tasks, and informed egos are added to OUT/best_responses.json.
+    Finished training runs are reused, and stopped runs resume. On the track `preference` each teammate of a layout's
+    tasks wants each of their dishes, scripts play the same tasks, and informed egos that played all test tasks of a
+    layout are added to OUT/best_responses.json.
     """
     from icrl4aht_baselines.online.adaptation import adaptation_jobs, informed_responses, write_adaptation
     from icrl4aht_baselines.online.responses import add_responses
@@ -223,9 +225,10 @@ def adaptation_headroom_command(seeds: int, training: dict[str, Any], out: Path,
     jobs = adaptation_jobs(sets, seeds, replace_options(ResponseOptions(_STEPS), training), out)
 
     def write(folder: Path) -> Path:
-        if found := informed_responses(jobs):
+        path = write_adaptation(jobs, folder)
+        if found := informed_responses(jobs, folder):
             add_responses(found, folder, _model_returns())
-        return write_adaptation(jobs, folder)
+        return path
 
     return jobs, write, lambda folder: adaptation_table(read_adaptation(folder))
 

@@ -8,7 +8,6 @@ returns. On the track `preference`, reference egos also play the tasks.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from scipy import stats
 from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks
-from icrl4aht_baselines.online.responses import PROTOCOL, EgoJob, choose_best_response
+from icrl4aht_baselines.online.responses import PROTOCOL, EgoJob, choose_best_response, stored_responses
 from icrl4aht_baselines.online.rl2 import PlayTask
 from icrl4aht_baselines.training.options import ResponseOptions
 from icrl4aht_data.benchmark.adaptation import ADAPTATION, EGO_KINDS, SCRIPTS, adaptation_table, read_adaptation
@@ -34,7 +33,7 @@ from icrl4aht_data.utils.files import atomic_write, json_hash, write_atomically,
 from icrl4aht_data.utils.groups import grouped
 
 MEASURED_EPISODES = 100
-"""Number of episodes of each task over which the mean return of a trained ego is measured."""
+"""Number of episodes over which the mean return of a trained ego is measured, for each parallel copy of a task."""
 
 _MEASURE_SEED = 1_000
 
@@ -164,7 +163,7 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
         return None
     found = {(job.kind, job.seed): job.result()["returns"] for job in own}
     scripts = {job.kind: job.result()["returns"] for job in jobs if job.kind in SCRIPTS and job.is_finished()}
-    if len(scripts) < len(SCRIPTS):
+    if len(scripts) < len(SCRIPTS) or any(task.task_id not in scripts["stay"] for task in own[0].tasks):
         scripts = {}
 
     def mean(returns: Mapping[str, float]) -> float:
@@ -206,12 +205,22 @@ def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
     return path
 
 
-def informed_responses(jobs: Sequence[AdaptationJob]) -> list[BestResponse]:
-    """Return the informed egos of finished jobs as best responses, one for each test task of the track `preference`."""
-    tasks = {task.task_id: task for task in bundled_tasks(PREFERENCE, "test")}
-    runs = defaultdict(list)
+def informed_responses(jobs: Sequence[AdaptationJob], folder: Path) -> list[BestResponse]:
+    """Return the informed egos of finished jobs as best responses, one for each test task of the track `preference`.
+
+    Jobs that lack some test tasks of their layout are left out. Earlier runs in the folder's best responses are kept.
+    """
+    tested = grouped(bundled_tasks(PREFERENCE, "test"), lambda task: task.layout_name)
+    known = {one.tasks: one.seeds for one in stored_responses(folder)}
+    found: dict[str, BestResponse] = {}
     for job in (job for job in jobs if job.kind == "informed" and job.is_finished()):
+        tasks, returns = tested.get(job.tasks[0].layout_name, []), job.result()["returns"]
+        if job.tasks[0].track != PREFERENCE or any(task.task_id not in returns for task in tasks):
+            continue
         steps, width = job.options.updates * job.options.steps_per_update, job.options.width
-        for task, earned in job.result()["returns"].items():
-            runs[task].append(TrainingRun(job.seed, steps, earned, width, acting="sampled", tasks=len(job.tasks)))
-    return [choose_best_response([task], runs[name]) for name, task in tasks.items() if name in runs]
+        for task in tasks:
+            name = task.task_id
+            run = TrainingRun(job.seed, steps, returns[name], width, acting="sampled", tasks=len(job.tasks))
+            earlier = found[name].seeds if name in found else known.get((name,), ())
+            found[name] = choose_best_response([task], [*earlier, run])
+    return list(found.values())

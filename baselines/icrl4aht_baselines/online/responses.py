@@ -63,7 +63,8 @@ ABOUT = (
     "cleared before each episode, and imitates the oracle in the first half of the training. Episodes of seed "
     f"{CHOICE_SEEDS[0]} decide between training runs. Returns are means over tasks and the seeds "
     f"{', '.join(map(str, REPORT_SEEDS))}. For each of these seeds, the stored model that earns most with the other "
-    "two is used instead if it earns more with them. On the track `preference`, best responses are informed egos."
+    "two is used instead if it earns more with them. On the track `preference`, best responses are informed egos, "
+    "which observe the task's number."
 )
 
 PLAY = PlayOptions(task_end=1.0)
@@ -264,7 +265,7 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainingRun]
 
     The run with the highest mean return in episodes with the seeds `CHOICE_SEEDS` is chosen. The result's field `best`
     is the mean return of this run in other episodes, with the seeds `REPORT_SEEDS`. Of several runs with the same seed,
-    initial model, steps and width, only the last is used.
+    tasks, initial model, steps and width, only the last is used.
     """
     task, seeds = tasks[0], {(one.tasks, one.init, one.steps, one.width, one.seed): one for one in trainings}
     best = best_training_run(seeds.values())
@@ -324,7 +325,7 @@ def write_responses(
         folder: folder of the file.
         models: model -> task id -> mean returns, see `include_models`.
     """
-    known = {one.tasks: one for one in _stored_responses(folder)}
+    known = {one.tasks: one for one in stored_responses(folder)}
     found = []
     for ids, own in grouped(
         [job for job in jobs if job.is_finished()], lambda job: tuple(task.task_id for task in job.tasks)
@@ -334,7 +335,8 @@ def write_responses(
     return add_responses(found, folder, models)
 
 
-def _stored_responses(folder: Path) -> tuple[BestResponse, ...]:
+def stored_responses(folder: Path) -> tuple[BestResponse, ...]:
+    """Return the best responses in a folder's file `RESPONSES_FILE`; none if the file does not exist."""
     path = folder / RESPONSES_FILE
     return read_best_responses(path).behaviours if path.is_file() else ()
 
@@ -347,7 +349,7 @@ def add_responses(found: Sequence[BestResponse], folder: Path, models: Mapping[s
     beside the file.
     """
     new, path = {task for one in found for task in one.tasks}, folder / RESPONSES_FILE
-    kept = [one for one in _stored_responses(folder) if new.isdisjoint(one.tasks)]
+    kept = [one for one in stored_responses(folder) if new.isdisjoint(one.tasks)]
     behaviours = tuple(include_models(one, models) for one in (*kept, *found))
     card = BestResponseCard(json_hash(to_builtins(behaviours)), PROTOCOL, ABOUT, behaviours)
     write_best_responses(path, card)
@@ -373,5 +375,5 @@ def responses_table(folder: Path) -> str:
             "" if best.slope is None else f"{best.slope:+.1f}",
         ]
         body.append([one.layout, one.split, f"{one.family} {numbers}", f"{one.best:.1f}", one.agent, spread, *training])
-    header = ["layout", "split", "teammates", "B", "of", "trainings", "number", "steps", "width", "rise"]
+    header = ["layout", "split", "teammates", "B", "ego", "range of runs", "runs", "steps", "width", "rise"]
     return markdown_table(header, body)

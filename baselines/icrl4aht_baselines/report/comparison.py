@@ -333,18 +333,23 @@ def controls_table(results: Mapping[str, AgentReturns], scales: CellScales, effe
     """Return table 2: benefit M of memory, benefit P of the right context, and mean returns in blocks of episodes.
 
     Means are over the combinations of layout and family that the agent played and that have headroom, or over all that
-    it played if none of them has headroom, separately for the published tracks and the track `preference`.
+    it played if none of them has headroom. On the track `preference`, means are over layouts.
     """
     body = []
     for where in (PUBLISHED_TRACKS, PREFERENCE):
         for agent, cells in results.items():
-            played = [cells[cell].blocks for cell in _controlled_cells(cells, scales).get(where, ())]
-            if not played:
+            chosen = _controlled_cells(cells, scales).get(where, [])
+            units = grouped(chosen, lambda cell: cell.layout if cell.kind == PREFERENCE else cell).values()
+            if not units:
                 continue
             tested = (effects.get((control, where, agent)) for control in ("cleared", "swapped"))
             row = [f"`{agent}`", where, *(effect.text(1) if effect else "–" for effect in tested)]
             for block in EPISODE_BLOCKS:
-                parts = [blocks[block] for blocks in played if block in blocks]
+                parts = [
+                    np.concatenate([cells[cell].blocks[block] for cell in unit], axis=1)
+                    for unit in units
+                    if all(block in cells[cell].blocks for cell in unit)
+                ]
                 row.append(f"{mean_over_cells(parts):z.1f}" if parts else "–")
             body.append(row)
     return markdown_table(["model", "tracks", "M", "P", *EPISODE_BLOCKS], body, right=len(EPISODE_BLOCKS))

@@ -120,7 +120,7 @@ def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
     """Return the reference returns of each result cell under a protocol, if all its tasks have best responses.
 
     The test cells of a layout are left out if the layout has a test cell without best responses in which the oracle
-    earns over 1 more than `stay`.
+    earns over 1 more than `stay`. The cells of the track `preference` are left out if one of them lacks best responses.
     """
     measured, stays, names = best_responses(protocol), stay_returns(protocol), behaviour_names()
     found: dict[ResultCell, CellScale] = {}
@@ -132,7 +132,13 @@ def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
             found[cell] = CellScale(scales)
     wanted = (ResultCell(*cell) for cell, egos in read_reference_returns(protocol).items() if has_headroom(egos))
     unfinished = {cell.layout for cell in wanted if cell not in found}
-    return {cell: scale for cell, scale in found.items() if cell.kind != "test" or cell.layout not in unfinished}
+    own = [cell for cell in bundled_ids_by_cell() if cell.kind == PREFERENCE]
+    unfinished |= {cell.layout for cell in own} if any(cell not in found for cell in own) else set()
+    return {
+        cell: scale
+        for cell, scale in found.items()
+        if cell.kind not in ("test", PREFERENCE) or cell.layout not in unfinished
+    }
 
 
 def add_scales(table: pd.DataFrame) -> pd.DataFrame:
@@ -269,7 +275,9 @@ def _strata_by_layout(
 
 
 def stratum_of_behaviours(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
-    """Return a stratum for the bootstrap, with behaviours as units, or seeds if fewer than two behaviours have a scale.
+    """Return a stratum for the bootstrap, with behaviours as units, or seeds.
+
+    Units are seeds if fewer than two behaviours have scales above a tenth of the mean scale.
 
     Args:
         values: numerators of the tasks, of shape (T, U, S).
@@ -277,7 +285,7 @@ def stratum_of_behaviours(values: np.ndarray, scales: np.ndarray, behaviours: Se
         behaviours: name of the teammate's behaviour in each task.
     """
     names, seeds = list(dict.fromkeys(behaviours)), values.shape[2]
-    # A resample of behaviours without the only one with a scale would have a denominator of about 0.
+    # A resample of behaviours without the only one with headroom would have a denominator of about 0.
     if len({name for name, scale in zip(behaviours, scales, strict=True) if scale > 0.1 * scales.mean()}) < 2:
         return Stratum(values.sum(axis=1) / seeds, np.full(seeds, scales.sum() / seeds))
     member = np.array([[name == own for name in names] for own in behaviours], float)

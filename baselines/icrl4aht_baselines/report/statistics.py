@@ -3,8 +3,8 @@
 Intervals are studentized bootstrap intervals (Efron and Tibshirani 1993, ch. 12.5). With five teammates, percentile
 intervals would be too narrow by a tenth, since the variance of resamples is (n - 1) / n of the true variance; dividing
 by the standard error of each resample corrects this. Teammates' behaviours are resampled within a combination of layout
-and family, or the seeds if there is a single behaviour. Training runs are resampled for all combinations together. The
-random generator has a fixed seed, so that results are reproducible.
+and family, or the seeds if fewer than two behaviours have headroom. Training runs are resampled for all combinations
+together. The random generator has a fixed seed, so that results are reproducible.
 
 Shapes: T training runs, U units of a stratum (behaviours, or seeds), S seeds, R resamples.
 """

@@ -180,9 +180,11 @@ def check_submission(found: Submission, where: str) -> None:
         _check_evaluation(one, part)
         for task in one.returns if one.control == "swapped" else ():
             if one.partners.get(task) != partners.get(task, one.partners.get(task)):
+                own = one.partners.get(task)
+                found_text = f"has the teammates of {own}" if own else "does not state its teammates"
                 raise OptionError(
-                    f"{part}: task {task} has the teammates of {one.partners.get(task)}, expected those of "
-                    f"{partners[task]}; evaluate all tasks of the track with one command"
+                    f"{part}: task {task} {found_text}, expected those of {partners[task]}; evaluate all tasks of the "
+                    f"track with one command, and make the file again"
                 )
         played[one.control, one.training] += one.returns
     named = f"the {counted_noun(len(expected), 'test task')} of {' and '.join(found.tracks)}"

@@ -117,6 +117,6 @@ class TrainingJob(ABC):
             if self.is_finished():
                 return
             content = {"settings": self.settings, **self.measure(on_update)}
-            self.folder.mkdir(parents=True, exist_ok=True)  # only training makes the folder, and a job may need none
+            self.folder.mkdir(parents=True, exist_ok=True)  # a job that trains nothing has no folder yet
             with atomic_write(self.result_file) as partial:
                 write_json(partial, content)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from icrl4aht_baselines.commands import experiment_commands
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.protocols import test_tasks as tasks_of
 from icrl4aht_baselines.online import adaptation, responses
@@ -26,7 +27,7 @@ from icrl4aht_generation.teammates.distances import common_records
 
 from icrl4aht_data.benchmark.adaptation import EGO_KINDS, SCRIPTS, adaptation_table, read_adaptation, task_set_name
 from icrl4aht_data.benchmark.best_responses import read_best_responses
-from icrl4aht_data.benchmark.facts import PREFERENCE, PREFERENCE_LAYOUTS
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE, PREFERENCE_LAYOUTS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.text import card_file
 from tests.helpers.paths import ROOT
@@ -144,9 +145,21 @@ def test_scripts_and_informed_egos_of_track_preference_are_stored(tmp_path, monk
     entry = adaptation_entry("few", jobs)
     assert entry and entry["number"] == 4
     assert entry["scripts"] == pytest.approx(means, abs=1e-3)
-    found = informed_responses(jobs)
-    assert [one.tasks for one in found] == [(task.task_id,) for task in tasks], "other tasks are no test tasks"
-    assert {(one.best, one.agent, one.seeds[0].tasks) for one in found} == {(7.0, "informed ego, seed 0", 4)}
+    assert informed_responses(jobs, tmp_path) == [], "other test tasks of the layout are missing"
+    every = [task for task in bundled_tasks(PREFERENCE, "test") if task.layout.name == "rooms-0-46"]
+    for seed, steps, earned in ((0, 400, 7.0), (1, 400, 9.0), (0, 800, 8.0)):
+        own = replace(TINY, steps=steps, tasks=32 if steps == 400 else 64)
+        (job,) = [one for one in adaptation_jobs({"all": every}, 2, own, tmp_path / str(steps))
+                  if (one.kind, one.seed) == ("informed", seed)]  # fmt: skip
+        (tmp_path / str(steps) / job.name).mkdir(parents=True)
+        content = {"settings": job.settings, "returns": {task.task_id: earned for task in job.tasks}}
+        (tmp_path / str(steps) / job.name / "result.json").write_text(json.dumps(content))
+        responses.add_responses(informed_responses([job], tmp_path), tmp_path, {})
+    stored = read_best_responses(tmp_path / "best_responses.json").behaviours
+    assert [one.tasks for one in stored] == [(task.task_id,) for task in every]
+    assert {(one.best, one.agent, len(one.seeds), one.seeds[0].tasks) for one in stored} == {
+        (8.0, "informed ego, seed 0", 3, 20)
+    }, "the run with the most steps counts, and earlier runs are kept"
 
 
 def test_headroom_tables_in_cards_and_docs_match_stored_results():
@@ -154,6 +167,9 @@ def test_headroom_tables_in_cards_and_docs_match_stored_results():
     page = (ROOT / "docs" / "preference.md").read_text(encoding="utf-8")
     entries = read_adaptation(card_file("adaptation.json").parent)
     assert adaptation_table(entries) in card_file("adaptation.md").read_text(encoding="utf-8")
+    responses_card = card_file("best_responses.md")
+    assert responses.responses_table(responses_card.parent) in responses_card.read_text(encoding="utf-8")
+    assert read_best_responses().about == responses.ABOUT
     own = [entry for entry in entries if entry["tasks"].startswith(f"{PREFERENCE}-test-")]
     assert {entry["tasks"] for entry in own} == {
         task_set_name(PREFERENCE, "test", layout) for of in PREFERENCE_LAYOUTS.values() for layout in of
@@ -175,6 +191,24 @@ def test_all_episodes_of_a_best_response_are_split_into_choice_and_report(tmp_pa
     job = ResponseJob((DEMO[0], DEMO[1]), 0, TINY, tmp_path)
     policy: Any = None  # not used by the replaced function
     assert job._mean_returns(policy) == {"choice": 1000.0, "return": 1.0}
+
+
+def test_stored_models_have_returns_with_each_seed_on_all_tracks():
+    found = experiment_commands._model_returns()["rl2-adapting"]
+    ids = {task.task_id for track in ALL_TRACKS for task in bundled_tasks(track, "test")}
+    assert found.keys() == ids
+    assert {values.shape for values in found.values()} == {(3,)}
+
+
+def test_sets_without_tasks_of_track_preference_have_no_returns_of_scripts(tmp_path):
+    """Jobs on two tracks: scripts play the tasks of one of them only."""
+    sets = {"demo_wide": DEMO[:2], "rooms": bundled_tasks(PREFERENCE, "test")[:2]}
+    jobs = adaptation_jobs(sets, 1, TINY, tmp_path)
+    for job in jobs:
+        (tmp_path / job.name).mkdir()
+        content = {"settings": job.settings, "returns": {task.task_id: 1.0 for task in job.tasks}}
+        (tmp_path / job.name / "result.json").write_text(json.dumps(content))
+    assert ["scripts" in (adaptation_entry(name, jobs) or {}) for name in sets] == [False, True]
 
 
 def test_headroom_job_with_fewer_tasks_than_needed_raises_error(tmp_path):

@@ -112,7 +112,7 @@ def test_controls_table_has_memory_and_partner_controls_and_episode_blocks(store
 
 
 def test_results_on_track_preference_have_their_own_columns_and_rows(stored, tmp_path, monkeypatch):
-    """They are added to the agent's results on other tracks; without best responses there is no score."""
+    """They are added to the agent's results on other tracks, which stay as they were."""
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: tmp_path / "both.json")
     write_invented_responses(tmp_path / "both.json", preference=True)
     write_results(tmp_path / "high", "high", [12.0] * 100, PREFERENCE)
@@ -126,7 +126,7 @@ def test_results_on_track_preference_have_their_own_columns_and_rows(stored, tmp
     assert "| N, layout | IQM, layout | N, preference |" in table
     high, low = agent_row(table, "high"), agent_row(table, "low")
     assert high[8].startswith("**0.51 (") and low[8:] == ["–"]
-    assert high[:8] == agent_row(comparison.agents_table(stored, stored.returns(), scales, found), "high")[:8]
+    assert high[:8] == agent_row(comparison.agents_table(stored, stored.returns(), scales, effects(stored)), "high")[:8]
     lines = comparison.controls_table(more.returns(), scales, found).splitlines()
     rows = [line for line in lines if PREFERENCE in line]
     assert len(rows) == 1 and rows[0].startswith("| `high` | preference | **+7.0 (+7.0 to +7.0)** | – | 12.0 |")

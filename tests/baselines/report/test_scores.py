@@ -14,7 +14,7 @@ from msgspec import structs
 
 from icrl4aht_data.benchmark import best_responses
 from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
-from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.facts import PREFERENCE, TRACKS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
 from icrl4aht_data.errors import OptionError
 from tests.helpers.evaluated import SPAN, TEST_TASKS, evaluated_run, write_invented_responses
@@ -76,6 +76,23 @@ def test_teammates_with_equal_behaviour_count_as_one_unit():
     assert pair[0] and pair[1] is None
     single = scores.find_score({WIDE: one}, [WIDE], {WIDE: cell_scale((0.0, 20.0, "same"))})
     assert single and single.total == pytest.approx(pair[0].total) and pair[0].total.range()
+
+
+def test_seeds_are_resampled_if_one_behaviour_has_headroom():
+    """Without its only behaviour with headroom, a resample would have no scale: units are the seeds then."""
+    values, names = np.arange(15.0).reshape(1, 5, 3), list("abcde")
+    one = scores.stratum_of_behaviours(values, np.array([0.0, 0.0, 30.0, 0.1, 0.0]), names)
+    assert one.gains.shape == (1, 3) and one.scales.tolist() == pytest.approx([30.1 / 3] * 3)
+    two = scores.stratum_of_behaviours(values, np.array([0.0, 0.0, 30.0, 20.0, 0.0]), names)
+    assert two.gains.shape == (1, 5) and two.scales.tolist() == [0.0, 0.0, 30.0, 20.0, 0.0]
+
+
+def test_tasks_of_a_layout_of_track_preference_form_one_stratum():
+    """On other tracks, each cell is a stratum."""
+    parts = [(np.full((1, 1, 3), value), np.array([20.0]), [name]) for value, name in ((1.0, "a"), (9.0, "b"))]
+    for kind, shapes in ((PREFERENCE, [(1, 2)]), ("test", [(1, 3), (1, 3)])):
+        cells = [ResultCell("rooms-0-46", family, kind) for family in ("H1", "H2")]
+        assert [stratum.gains.shape for stratum in scores._pooled_strata(cells, parts).values()] == shapes
 
 
 def test_layout_with_a_missing_best_response_has_no_score(invented_responses, monkeypatch, tmp_path):
