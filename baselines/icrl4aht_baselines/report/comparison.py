@@ -236,9 +236,7 @@ def render_comparison(stored: StoredResults) -> str:
     measured, scored = read_best_responses(), cells_with_headroom(scales)
     shown = stored.with_other_play_modes(results)
     effects = secondary_effects(stored, results, scales)
-    flat = [
-        f"{cell.layout} {cell.family}" for cell in sorted_cells(scales) if cell.kind == "test" and cell not in scored
-    ]
+    flat = [" ".join(cell[:2]) for cell in sorted_cells(scales) if cell.kind == "test" and cell not in scored]
     one_way = [f"`{agent}`" for agent in results if not any(f"{agent} ({way})" in shown for way in OTHER_WAYS)]
     return fill_template(
         "results.md",
@@ -345,11 +343,8 @@ def controls_table(results: Mapping[str, AgentReturns], scales: CellScales, effe
             tested = (effects.get((control, where, agent)) for control in ("cleared", "swapped"))
             row = [f"`{agent}`", where, *(effect.text(1) if effect else "–" for effect in tested)]
             for block in EPISODE_BLOCKS:
-                parts = [
-                    np.concatenate([cells[cell].blocks[block] for cell in unit], axis=1)
-                    for unit in units
-                    if all(block in cells[cell].blocks for cell in unit)
-                ]
+                played = [[cells[cell].blocks[block] for cell in unit if block in cells[cell].blocks] for unit in units]
+                parts = [np.concatenate(of, axis=1) for of in played if of]
                 row.append(f"{mean_over_cells(parts):z.1f}" if parts else "–")
             body.append(row)
     return markdown_table(["model", "tracks", "M", "P", *EPISODE_BLOCKS], body, right=len(EPISODE_BLOCKS))
