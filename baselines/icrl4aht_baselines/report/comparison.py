@@ -368,9 +368,9 @@ def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, s
         for track in ALL_TRACKS:
             score = find_score(cells, cells_with_headroom(scales, track), scales)
             texts.append(f"N {_format_interval(score and score.total)} on track {track}")
-        for where, own in _controlled_cells(cells, scales).items():
-            memory, on = block_difference(cells, cleared, own, "all"), " on preference" * (where == PREFERENCE)
-            texts.append(f"M {_format_interval(memory, 1, '+')}{on}")
+        for where, on in ((PUBLISHED_TRACKS, "on tracks teammate and layout"), (PREFERENCE, "on track preference")):
+            memory = block_difference(cells, cleared, _controlled_cells(cells, scales).get(where, ()), "all")
+            texts.append(f"M {_format_interval(memory, 1, '+')} {on}")
         found[agent] = ", ".join(texts)
     return found
 

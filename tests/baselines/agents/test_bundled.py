@@ -131,6 +131,7 @@ def test_training_rejects_initial_parameters_of_another_model_size(trained_run, 
 
 def test_models_command_lists_bundled_models(models):
     printed = run_cli("models")
-    assert re.search(r"^ad-tiny: ; N – on track teammate, N – on track layout, M –; of 20\d\d-\d\d-\d\d\n", printed)
+    scores = "N – on track teammate, N – on track layout, N – on track preference, M – on tracks teammate and layout"
+    assert re.search(rf"^ad-tiny: ; {scores}, M – on track preference; of 20\d\d-\d\d-\d\d\n", printed)
     assert "\n  track teammate: AD+mlp, " in printed
     assert "parameters, K = 6, 1 steps on demo_wide (source noise)" in printed
