@@ -93,8 +93,8 @@ class StoredResults:
 
     Attributes:
         table: table of results, see `results`.
-        curves: mean return in each episode of the test tasks on a layout, over tasks, seeds and training runs, with the
-            columns `CURVE_COLUMNS`.
+        curves: mean return in each episode on a published layout's test tasks, over tasks, seeds and training runs,
+            with the columns `CURVE_COLUMNS`.
         agents: name of an agent -> facts that tables state; agents are shown in this order.
     """
 
@@ -188,7 +188,8 @@ def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
         run = as_run([Result(task, one.settings, returns) for task, returns in one.returns.items()], found.agent, tasks)
         tables.append(run.table.assign(agent=found.agent, training=one.training, control=one.control))
         for cell, returns in run.cells.items():
-            curves[one.control, cell.layout].append(returns)
+            if cell.layout in TEST_LAYOUTS:  # the figure has no other layouts
+                curves[one.control, cell.layout].append(returns)
     rows = [
         (found.agent, SUBMITTED_PROTOCOL, control, layout, episode, value)
         for (control, layout), parts in curves.items()

@@ -119,6 +119,7 @@ def test_results_on_track_preference_have_their_own_columns_and_rows(stored, tmp
     write_results(tmp_path / "high" / "cleared", "high (cleared)", [5.0] * 100, PREFERENCE, forget=True)
     more = comparison.add_submission(stored, make_submission([tmp_path / "high"], FACTS, update=True))
     assert len(more.table) == len(stored.table) + 2 * 120 * 3 * 6, "results on the track layout are kept"
+    assert len(more.curves) == len(stored.curves), "the figure shows published layouts only"
     scales, found = cell_scales("seeded"), effects(more)
     assert len([cell for cell in scales if cell.kind == PREFERENCE]) == len({(cell.layout, cell.family)
                for cell in more.returns()["high"] if cell.kind == PREFERENCE})  # fmt: skip
