@@ -25,8 +25,8 @@ three on published layouts."""
 _LAYOUT_TASKS = 20  # number of test tasks on each published layout
 
 ADAPTATION = "adaptation.json"
-"""Name of the file of measured returns, in a folder of training runs and among the package's cards. A Markdown file
-beside it has the same returns as a table."""
+"""Name of the file of measured returns, in a folder of training runs and among the package's cards. The Markdown file
+of the same name has the returns as a table."""
 
 
 def read_adaptation(folder: Path) -> list[dict[str, Any]]:

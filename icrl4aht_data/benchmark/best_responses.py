@@ -3,7 +3,7 @@
 The file `cards/best_responses.json` stores the best responses. A best response is a recurrent ego that was trained with
 one teammate, or a model of the page of results that earned more than this ego in the episodes used to choose between
 them. On the track `preference` it is an informed ego, which also observes the task's number, see
-`icrl4aht_data.benchmark.adaptation`. Tasks whose teammates behave the same share a best response.
+`icrl4aht_data.benchmark.adaptation`. Tasks share a best response if their teammates behave the same.
 """
 
 from __future__ import annotations

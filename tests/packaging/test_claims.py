@@ -155,7 +155,7 @@ def proof_returns() -> tuple[float, ...]:
 
 
 def training_teammates_like_tests() -> tuple[int, ...]:
-    """Return the numbers of training tasks of `preference` whose teammate acts like a test instance, and of all tasks.
+    """Return two numbers for each of two layouts: training tasks with a teammate like a test instance, and all tasks.
 
     Distances are measured on test_wide and asymm_both, with their indicators.
     """

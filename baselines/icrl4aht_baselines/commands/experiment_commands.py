@@ -130,10 +130,10 @@ def _model_returns() -> dict[str, dict[str, Any]]:
     """
     from icrl4aht_baselines.online.responses import REPORT_SEEDS
     from icrl4aht_baselines.report.comparison import read_stored, results_file
-    from icrl4aht_baselines.report.results import task_label
-    from icrl4aht_baselines.report.submission import track_tasks
+    from icrl4aht_baselines.report.results import bundled_tasks_by_id, task_label
 
-    ids, stored = {task_label(task): task for task in track_tasks(ALL_TRACKS)}, read_stored(results_file())
+    ids = {task_label(task): task for task in bundled_tasks_by_id("test", ALL_TRACKS)}
+    stored = read_stored(results_file())
     return {
         agent: {
             ids[task]: values

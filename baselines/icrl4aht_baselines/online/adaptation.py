@@ -179,7 +179,7 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
     return {
         "tasks": title,
         "number": len(own[0].tasks),
-        "steps": own[0].options.updates * own[0].options.steps_per_update,
+        "steps": own[0].options.played_steps,
         "width": own[0].options.width,
         "returns": returns,
         "interval": interval,
@@ -190,8 +190,8 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
 def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
     """Add the measurements of finished jobs to a folder's file `ADAPTATION`. Return the file's path.
 
-    The entry of a set of tasks is replaced, unless the stored entry has more seeds. The table of all entries is written
-    beside it.
+    The entry of a set of tasks is replaced, unless the stored entry has more seeds. A Markdown file of the same name
+    gets a table of all entries.
     """
     path = folder / ADAPTATION
     known = {entry["tasks"]: entry for entry in read_adaptation(folder)}
@@ -217,7 +217,7 @@ def informed_responses(jobs: Sequence[AdaptationJob], folder: Path) -> list[Best
         tasks, returns = tested.get(job.tasks[0].layout_name, []), job.result()["returns"]
         if job.tasks[0].track != PREFERENCE or any(task.task_id not in returns for task in tasks):
             continue
-        steps, width = job.options.updates * job.options.steps_per_update, job.options.width
+        steps, width = job.options.played_steps, job.options.width
         for task in tasks:
             name = task.task_id
             run = TrainingRun(job.seed, steps, returns[name], width, acting="sampled", tasks=len(job.tasks))

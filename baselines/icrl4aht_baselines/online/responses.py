@@ -250,7 +250,7 @@ def trained_response(job: ResponseJob) -> TrainingRun:
     acting, earned = max(result["modes"].items(), key=lambda mode: mode[1]["choice"])
     return TrainingRun(
         seed=job.seed,
-        steps=job.options.updates * job.options.steps_per_update,
+        steps=job.options.played_steps,
         width=job.options.width,
         mean_return=earned["return"],
         choice=earned["choice"],
@@ -345,8 +345,8 @@ def add_responses(found: Sequence[BestResponse], folder: Path, models: Mapping[s
     """Add best responses to the file `RESPONSES_FILE` in a folder. Return the file's path.
 
     Earlier entries that share tasks with the new ones are removed. For all entries, `include_models` chooses between
-    trained egos and stored models. The version in the file is a hash of all entries. A table of all entries is written
-    beside the file.
+    trained egos and stored models. The version in the file is a hash of all entries. A Markdown file of the same name
+    gets a table of all entries.
     """
     new, path = {task for one in found for task in one.tasks}, folder / RESPONSES_FILE
     kept = [one for one in stored_responses(folder) if new.isdisjoint(one.tasks)]

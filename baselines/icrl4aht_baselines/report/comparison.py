@@ -24,6 +24,7 @@ from icrl4aht_baselines.report.results import (
     AgentReturns,
     ResultCell,
     as_run,
+    bundled_tasks_by_id,
     mean_over_cells,
     returns_by_cell,
     sorted_cells,
@@ -39,7 +40,7 @@ from icrl4aht_baselines.report.scores import (
     score_difference,
 )
 from icrl4aht_baselines.report.statistics import MeanInterval, holm_corrected
-from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission, track_tasks
+from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.adaptation import published_adaptation_table
 from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
@@ -183,7 +184,7 @@ def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
     If `Submission.update` is set, they replace the agent's stored results on the same layouts.
     """
     controls = {one.control for one in found.evaluations}
-    tables, curves, tasks = [], defaultdict(list), [*track_tasks(found.tracks).values()]
+    tables, curves, tasks = [], defaultdict(list), [*bundled_tasks_by_id("test", tuple(found.tracks)).values()]
     for one in found.evaluations:
         run = as_run([Result(task, one.settings, returns) for task, returns in one.returns.items()], found.agent, tasks)
         tables.append(run.table.assign(agent=found.agent, training=one.training, control=one.control))

@@ -433,9 +433,9 @@ def _rule_key(run: EvaluationRun) -> tuple[Any, ...]:
 
 
 @cache
-def bundled_tasks_by_id(split: str) -> dict[str, Task]:
-    """Return the tasks of a split of both benchmark tracks, by task id; split "test" has the 160 published tasks."""
-    return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, split)}
+def bundled_tasks_by_id(split: str, tracks: tuple[str, ...] = tuple(TRACKS)) -> dict[str, Task]:
+    """Return the tasks of a split by task id, by default of both benchmark tracks (160 published tasks in "test")."""
+    return {task.task_id: task for track in tracks for task in bundled_tasks(track, split)}
 
 
 def cell_of(task: Task) -> ResultCell:

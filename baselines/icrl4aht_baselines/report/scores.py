@@ -120,7 +120,7 @@ def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
     """Return the reference returns of each result cell under a protocol, if all its tasks have best responses.
 
     The test cells of a layout are left out if the layout has a test cell without best responses in which the oracle
-    earns over 1 more than `stay`. The cells of the track `preference` are left out if one of them lacks best responses.
+    earns over 1 more than `stay`. All cells of the track `preference` are left out if any lacks one.
     """
     measured, stays, names = best_responses(protocol), stay_returns(protocol), behaviour_names()
     found: dict[ResultCell, CellScale] = {}
@@ -391,7 +391,7 @@ def blocks_text(cells: Sequence[CellReturns]) -> str:
 class Headline(NamedTuple):
     """Summary of an evaluation run on one kind of tasks.
 
-    Only result cells with headroom whose tasks were all played count. If a run has no such cells, all its cells count.
+    It covers the result cells that have headroom and were played completely, or all cells if there are none.
 
     Attributes:
         label: label of the run, with symbols for overlap of its training data with the tasks.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,13 +19,12 @@ from msgspec import Meta
 
 from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import AGENTS, OTHER_WAYS
-from icrl4aht_baselines.evaluate.protocols import CONTROLS, bundled_tasks, get_protocol, plan_tasks
+from icrl4aht_baselines.evaluate.protocols import CONTROLS, get_protocol, plan_tasks
 from icrl4aht_baselines.evaluate.results import RESULTS
-from icrl4aht_baselines.report.results import find_training_record, read_results
+from icrl4aht_baselines.report.results import bundled_tasks_by_id, find_training_record, read_results
 from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import ALL_TRACKS, TRACKS
-from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import write_atomically
 from icrl4aht_data.utils.text import counted_noun
@@ -141,16 +140,11 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
             tasks |= set() if control else returns.keys()
             partners = {result.task_id: result.partners for result in results if result.partners}
             evaluations.append(Evaluation(control or way, training, settings, returns, partners))
-    tracks: Any = [track for track in ALL_TRACKS if tasks & track_tasks([track]).keys()] or [*TRACKS]
+    tracks: Any = [track for track in ALL_TRACKS if tasks & bundled_tasks_by_id("test", (track,)).keys()] or [*TRACKS]
     name = agent or evaluations[0].settings["agent"].removesuffix(f" ({evaluations[0].control})")
     found = Submission(1, name, facts, read_best_responses().version, tracks, evaluations, update)
     check_submission(found, ", ".join(map(str, folders)))
     return found
-
-
-def track_tasks(tracks: Iterable[str]) -> dict[str, Task]:
-    """Return the test tasks of some tracks by task id."""
-    return {task.task_id: task for track in tracks for task in bundled_tasks(track, "test")}
 
 
 def check_submission(found: Submission, where: str) -> None:
@@ -169,7 +163,7 @@ def check_submission(found: Submission, where: str) -> None:
             f"{where}: made with best responses {found.best_responses!r}, but this package has {known!r}; make the "
             f"file again with `icrl4aht-data submit`"
         )
-    expected = track_tasks(found.tracks)
+    expected = bundled_tasks_by_id("test", tuple(found.tracks))
     swapped = plan_tasks([*expected.values()], get_protocol(SUBMITTED_PROTOCOL), "swapped")
     partners = {plan.task.task_id: [*plan.partners] for plan in swapped}
     played: dict[tuple[str, int], list[str]] = defaultdict(list)
@@ -178,9 +172,9 @@ def check_submission(found: Submission, where: str) -> None:
         if one.control not in ("", *CONTROLS, *OTHER_WAYS):
             raise OptionError(f"{part}: control {one.control!r}, expected {' or '.join((*CONTROLS, *OTHER_WAYS))}")
         _check_evaluation(one, part)
-        for task in one.returns if one.control == "swapped" else ():
-            if one.partners.get(task) != partners.get(task, one.partners.get(task)):
-                own = one.partners.get(task)
+        for task in one.returns.keys() & partners if one.control == "swapped" else ():
+            own = one.partners.get(task)
+            if own != partners[task]:
                 found_text = f"has the teammates of {own}" if own else "does not state its teammates"
                 raise OptionError(
                     f"{part}: task {task} {found_text}, expected those of {partners[task]}; evaluate all tasks of the "

@@ -112,6 +112,11 @@ class ResponseOptions:
         """Number of training steps."""
         return max(1, self.steps // self.steps_per_update)
 
+    @property
+    def played_steps(self) -> int:
+        """Number of environment steps that a training run plays: a multiple of `steps_per_update`."""
+        return self.updates * self.steps_per_update
+
     def training(self, seed: int) -> TrainOptions:
         """Return the options of the trainer for a run with this seed."""
         settings = {**RL2_SETTINGS["train"], "steps": self.updates, "batch_size": self.tasks, "seed": seed}

@@ -218,7 +218,7 @@ def test_headroom_job_with_fewer_tasks_than_needed_raises_error(tmp_path):
 
 @pytest.mark.slow
 def test_tiny_best_response_and_headroom_jobs_finish(tmp_path, monkeypatch):
-    """Train a best response for one task, and the two egos whose returns are compared.
+    """Train a best response for one task, then an informed and an episodic ego for two tasks.
 
     A finished job does nothing.
     """
