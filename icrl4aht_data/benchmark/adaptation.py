@@ -1,4 +1,4 @@
-"""Adaptation headroom: how much more an ego earns that knows its teammate from the start.
+"""Adaptation headroom: how much more an ego earns if it knows the teammate than if it has to identify the teammate.
 
 `icrl4aht-data adaptation-headroom` measures it, and stores it in `cards/adaptation.json`. An *informed* ego observes
 the task's number in every step. An *episodic* ego has to identify the teammate in each episode.
@@ -67,12 +67,14 @@ def headroom_text(entry: Mapping[str, Any]) -> str:
 
 
 def adaptation_table(entries: Iterable[Mapping[str, Any]]) -> str:
-    """Return a Markdown table of measured sets of tasks: mean returns of egos and scripts, and the difference.
+    """Return a Markdown table with a row for each measured set of tasks.
+
+    A row has the mean returns of scripts and of both kinds of ego, and the difference between the two kinds.
 
     Columns of scripts are left out if no set has their returns.
 
     Args:
-        entries: entries of a file `ADAPTATION`.
+        entries: entries from `read_adaptation`.
     """
     entries, rows = list(entries), []
     scripts = [name for name in SCRIPTS if any("scripts" in entry for entry in entries)]

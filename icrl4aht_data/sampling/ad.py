@@ -179,7 +179,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
             # A window given by its first row is copied as a block, ten times faster than L single rows.
             return position, low + start, low + start, low + start - 1, valid
         # `t` counts only steps of every n-th episode: t means step t % steps of episode first + n * (t // steps).
-        # The step before the window comes first, for `prev_*`. Padding repeats the last step, since rows must exist.
+        # The step before the window comes first, for `prev_*`. Padding repeats the last step.
         t = np.minimum(start[:, None] + np.arange(-1, self.length), total[:, None] - 1)
         rows = low[:, None] + (first[:, None] + self.every * (t // steps)) * steps + t % steps
         # At the first step of episode `first`, `prev_*` come from the history's preceding episode, if there is one.

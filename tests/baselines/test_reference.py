@@ -92,13 +92,13 @@ def test_card_of_a_reference_model_shows_command_and_training_curves(tmp_path, m
     config = {"method": "ad", "model": {}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
     trained = {"config": config, "manifest_sha256": "ab12", "run_hash": "1"}
 
-    def invented_run(folder: Path) -> EvaluationRun:
+    def fake_run(folder: Path) -> EvaluationRun:
         run = evaluated_run(
             "ad-reference", ("cramped_down",) if "ad-reference-layout-s3" in folder.parts else ("demo_wide",)
         )
         return dataclasses.replace(run, sources=(run.sources[0]._replace(trained=trained, folder=str(folder)),))
 
-    monkeypatch.setattr(reference, "read_run", invented_run)
+    monkeypatch.setattr(reference, "read_run", fake_run)
     for track in TRACKS:
         (tmp_path / "ad-x" / track).mkdir(parents=True)
     (tmp_path / "ad-x" / "layout" / "curves.png").write_bytes(b"")

@@ -207,10 +207,9 @@ def trained_policy(method: Method, params: Any, context: int, mode: PlayMode = A
 
 
 def with_channels(policy: Policy, channels: Channels, hide_recipe: bool = False) -> Policy:
-    """Return a copy of a policy, to which the environment passes observations with the given channels.
+    """Return a copy of a policy that receives observations with the given channels.
 
-    Policies that have the same functions still have the same functions after the conversion, so they can share a
-    compiled program.
+    The copies of policies with the same functions also have the same functions, so they can share a compiled program.
 
     Args:
         policy: policy for observations with these channels.

@@ -170,35 +170,54 @@ def adaptation_entry(title: str, jobs: Sequence[AdaptationJob]) -> dict[str, Any
         return round(float(np.mean([returns[task.task_id] for task in own[0].tasks])), 3)
 
     returns = {kind: {str(seed): mean(found[kind, seed]) for seed in seeds} for kind in EGO_KINDS}
-    interval = None
-    if len(seeds) > 1:
-        informed, episodic = (np.array([*returns[kind].values()]) for kind in EGO_KINDS)
-        differences = informed - episodic
-        half = stats.t.ppf(0.975, len(seeds) - 1) * stats.sem(differences)
-        interval = [round(float(differences.mean() + side * half), 3) for side in (-1, 1)]
     return {
         "tasks": title,
         "number": len(own[0].tasks),
         "steps": own[0].options.played_steps,
         "width": own[0].options.width,
         "returns": returns,
-        "interval": interval,
+        "interval": _seed_interval(returns),
         **({"scripts": {name: mean(of) for name, of in scripts.items()}} if scripts else {}),
     }
+
+
+def _seed_interval(returns: Mapping[str, Mapping[str, float]]) -> list[float] | None:
+    """Return the 95 % interval of informed minus episodic returns over seeds; None if there is only one seed.
+
+    Args:
+        returns: kind of ego -> seed -> mean return.
+    """
+    informed, episodic = (np.array([*returns[kind].values()]) for kind in EGO_KINDS)
+    if len(informed) < 2:
+        return None
+    differences = informed - episodic
+    half = stats.t.ppf(0.975, len(differences) - 1) * stats.sem(differences)
+    return [round(float(differences.mean() + side * half), 3) for side in (-1, 1)]
+
+
+def _with_stored_seeds(entry: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a new entry together with the stored entry's other seeds if both have equal settings.
+
+    With other settings the entry that has more seeds is returned, or the new one if both have the same number.
+    """
+    if any(entry[name] != stored[name] for name in ("number", "steps", "width")):
+        return entry if len(entry["returns"]["informed"]) >= len(stored["returns"]["informed"]) else dict(stored)
+    merged = {kind: {**stored["returns"][kind], **entry["returns"][kind]} for kind in EGO_KINDS}
+    returns = {kind: dict(sorted(of.items(), key=lambda seed: int(seed[0]))) for kind, of in merged.items()}
+    return {**stored, **entry, "returns": returns, "interval": _seed_interval(returns)}
 
 
 def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
     """Add the measurements of finished jobs to a folder's file `ADAPTATION`. Return the file's path.
 
-    The entry of a set of tasks is replaced, unless the stored entry has more seeds. A Markdown file of the same name
-    gets a table of all entries.
+    Stored returns of other seeds are kept if the settings are equal. A Markdown file of the same name gets a table of
+    all entries.
     """
     path = folder / ADAPTATION
     known = {entry["tasks"]: entry for entry in read_adaptation(folder)}
     for title in dict.fromkeys(job.title for job in jobs if job.kind in EGO_KINDS):
-        entry = adaptation_entry(title, jobs)
-        if entry and len(known.get(title, entry)["returns"]["informed"]) <= len(entry["returns"]["informed"]):
-            known[title] = entry
+        if entry := adaptation_entry(title, jobs):
+            known[title] = _with_stored_seeds(entry, known.get(title, entry))
     with atomic_write(path) as partial:
         write_json(partial, list(known.values()))
     write_atomically(path.with_suffix(".md"), f"# Adaptation headroom\n\n{adaptation_table(known.values())}\n")

@@ -36,7 +36,7 @@ from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.utils.groups import grouped
 
 FLAT_SHARE = 0.3
-"""Number of tasks on a layout on which the oracle earns no more than `stay`, relative to other layouts."""
+"""Number of tasks on a layout on which measured egos earn about the same, relative to other layouts."""
 
 FOUR_RECIPES_SHARE = 0.2
 """Number of tasks on a layout's version with four recipes, relative to other layouts."""
@@ -258,9 +258,9 @@ def _rearranged_tasks(
 
 
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
-    """Return the relative number of tasks on each layout: 1, or `FLAT_SHARE` if the oracle earns no more than `stay`.
+    """Return the relative number of tasks on each layout: 1, or `FLAT_SHARE` if measured egos earn about the same.
 
-    A layout gets 1 if stored measurements show that the oracle earns more than `stay` with one of its teammates, or if
+    A layout gets 1 if the measured returns of egos with one of its teammates differ by `LEAST_HEADROOM` or more, or if
     one of its teammates was not measured.
     """
     matters: dict[str, bool] = defaultdict(bool)

@@ -26,6 +26,7 @@ from msgspec import structs, to_builtins
 from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import PlayMode, trained_policy, with_channels
 from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTask, PlayTrainer
@@ -41,7 +42,7 @@ from icrl4aht_data.benchmark.best_responses import (
     read_best_responses,
     write_best_responses,
 )
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, LAYOUT_NAMES, LEAST_HEADROOM, TESTED_ON
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LAYOUT_NAMES, LEAST_HEADROOM, PREFERENCE, TESTED_ON
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_reference_returns
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import unknown_name
@@ -344,13 +345,16 @@ def stored_responses(folder: Path) -> tuple[BestResponse, ...]:
 def add_responses(found: Sequence[BestResponse], folder: Path, models: Mapping[str, Mapping[str, np.ndarray]]) -> Path:
     """Add best responses to the file `RESPONSES_FILE` in a folder. Return the file's path.
 
-    Earlier entries that share tasks with the new ones are removed. For all entries, `include_models` chooses between
+    Earlier entries that share tasks with the new ones are removed, and a new entry takes the place of one with the same
+    tasks. For all entries, `include_models` chooses between
     trained egos and stored models. The version in the file is a hash of all entries. A Markdown file of the same name
     gets a table of all entries.
     """
-    new, path = {task for one in found for task in one.tasks}, folder / RESPONSES_FILE
-    kept = [one for one in stored_responses(folder) if new.isdisjoint(one.tasks)]
-    behaviours = tuple(include_models(one, models) for one in (*kept, *found))
+    path, new = folder / RESPONSES_FILE, {one.tasks: one for one in found}
+    played = {task for tasks in new for task in tasks}
+    stored = [one for one in stored_responses(folder) if one.tasks in new or played.isdisjoint(one.tasks)]
+    kept = [new.pop(one.tasks, one) for one in stored]
+    behaviours = tuple(include_models(one, models) for one in (*kept, *new.values()))
     card = BestResponseCard(json_hash(to_builtins(behaviours)), PROTOCOL, ABOUT, behaviours)
     write_best_responses(path, card)
     write_atomically(path.with_suffix(".md"), f"# Best responses\n\n{responses_table(folder)}\n")
@@ -360,13 +364,16 @@ def add_responses(found: Sequence[BestResponse], folder: Path, models: Mapping[s
 def responses_table(folder: Path) -> str:
     """Return a Markdown table of a folder's best responses.
 
-    Column "B" is the best return. Column "rise" is the `slope` of the best training run; a `slope` well above 0
+    On the track `preference`, column "teammates" also has the ingredient ids of the wanted dish. Column "B" is the best
+    return. Column "rise" is the `slope` of the best training run; a `slope` well above 0
     shows that the training was too short.
     """
     body = []
+    dishes = {task.task_id: task.recipes for task in bundled_tasks(PREFERENCE, "test")}
     for one in read_best_responses(folder / RESPONSES_FILE).behaviours:
         returns, best = [seed.mean_return for seed in one.seeds], best_training_run(one.seeds)
-        numbers = ", ".join(task.rsplit("_", 3)[1] for task in one.tasks)
+        mates = f"{one.family} {', '.join(task.rsplit('_', 3)[1] for task in one.tasks)}"
+        mates += "".join(f", dish {'-'.join(map(str, dish))}" for dish in dishes.get(one.tasks[0]) or ())
         spread = f"{min(returns):.1f} to {max(returns):.1f}" if len(returns) > 1 else ""
         training = [
             str(len(returns)),
@@ -374,6 +381,6 @@ def responses_table(folder: Path) -> str:
             str(best.width),
             "" if best.slope is None else f"{best.slope:+.1f}",
         ]
-        body.append([one.layout, one.split, f"{one.family} {numbers}", f"{one.best:.1f}", one.agent, spread, *training])
+        body.append([one.layout, one.split, mates, f"{one.best:.1f}", one.agent, spread, *training])
     header = ["layout", "split", "teammates", "B", "ego", "range of runs", "runs", "steps", "width", "rise"]
     return markdown_table(header, body)

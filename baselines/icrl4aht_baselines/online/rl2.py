@@ -311,7 +311,8 @@ def make_players(tasks: Sequence[PlayTask], method: Method, play: PlayOptions, m
 
     def program(task: PlayTask) -> tuple[Any, ...]:
         mate = task.teammate
-        # A teammate that sees a `Situation` gets the layout as data; the functions of other teammates need one layout.
+        # Teammates that see a `Situation` receive the layout as an input, so that one program serves several layouts.
+        # The functions of other teammates are made for one layout.
         shared = (mate.init, mate.act) if mate.sees == "situation" else (task.layout,)
         return (task.family, task.searched, *shared)
 
@@ -427,7 +428,7 @@ class PlayTrainer:
         return nullcontext(range(start, stop))
 
     def validation_lines(self, state: PlayState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
-        """Return an empty list, because models that play have no validation losses; use `evaluate` instead."""
+        """Return an empty list, because training by playing has no validation loss; use `evaluate` instead."""
         return []
 
     def step(self, state: PlayState, number: int) -> tuple[PlayState, dict[str, Array]]:

@@ -235,7 +235,7 @@ def render_comparison(stored: StoredResults) -> str:
     """Return the text of docs/results.md. Tables leave out agents of older code, see `AgentFacts.commit`."""
     scales = cell_scales(SUBMITTED_PROTOCOL)
     results = {agent: cells for agent, cells in stored.returns().items() if not stored.agents[agent].commit}
-    measured, scored = read_best_responses(), cells_with_headroom(scales)
+    scored = cells_with_headroom(scales)
     shown = stored.with_other_play_modes(results)
     effects = secondary_effects(stored, results, scales)
     flat = [" ".join(cell[:2]) for cell in sorted_cells(scales) if cell.kind == "test" and cell not in scored]
@@ -250,7 +250,7 @@ def render_comparison(stored: StoredResults) -> str:
         adaptation=published_adaptation_table({name: mean_best_return(name, scales) for name in TEST_LAYOUTS}),
         trainings=describe_training_runs(),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
-        measured=f"{measured.about.rstrip('.')} (version {measured.version}).",
+        version=read_best_responses().version,
         cells=f"{len(scored)} of {sum(cell.kind == 'test' for cell in scales)} cells",
         scored=", ".join(dict.fromkeys(cell.layout for cell in scored)) or "none",
         without=f". Without headroom: {', '.join(flat)}" if flat else "",
@@ -363,8 +363,7 @@ def _controlled_cells(cells: AgentReturns, scales: CellScales) -> dict[str, list
 
 def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, str]:
     """Return agent -> text with its score N on each track and the benefit M of its memory; a dash if missing."""
-    scales, results, controls = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), stored.returns("cleared")
-    found = {}
+    scales, results, controls, found = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), stored.returns("cleared"), {}
     for agent in agents:
         cells, cleared, texts = results.get(agent, {}), controls.get(agent, {}), []
         for track in ALL_TRACKS:
@@ -468,11 +467,12 @@ def _format_range(values: Sequence[int], form: str) -> str:
 def plot_comparison(stored: StoredResults, path: Path) -> None:
     """Plot the agents' returns by episode on a log axis, with dashed lines for cleared memory.
 
-    Each of the first six layouts with headroom has a panel. Horizontal lines show `stay` and best responses.
+    Each of the first six layouts with headroom in test tasks has a panel. Lines show `stay` and best responses.
     """
     scales, headroom = cell_scales(SUBMITTED_PROTOCOL), read_reference_returns(SUBMITTED_PROTOCOL)
-    cells = sorted_cells(cell for cell, has_any in known_headroom(SUBMITTED_PROTOCOL).items() if has_any)
-    layouts = list(dict.fromkeys(cell.layout for cell in cells))[:_PANELS]
+    known = known_headroom(SUBMITTED_PROTOCOL)
+    tested = (cell for cell in sorted_cells(known) if known[cell] and cell.kind == "test")
+    layouts = list(dict.fromkeys(cell.layout for cell in tested))[:_PANELS]
     figure, grid = panel_grid(layouts, 3, (3.6, 3), "episode")
     shown = [agent for agent in stored.returns() if not stored.agents[agent].commit]
     curves = {

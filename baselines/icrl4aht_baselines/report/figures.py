@@ -196,7 +196,7 @@ def _make_bar(
     clipped = "" if scale.low <= found.mean <= scale.high else "*"
     text = f"{found.mean:z.{digits}f}{clipped}{overlap_marks(returns.overlaps).strip()}"
     tooltip = f"{run.label}: {found.text(digits)}, return {mean_over_cells([returns.mean]):z.1f}"
-    interval = (scale.position(found.low), scale.position(found.high)) if found.range() else None
+    interval = (scale.position(found.low), scale.position(found.high)) if found.interval_text() else None
     return Bar(number, min(zero, end), abs(end - zero), interval, text, tooltip)
 
 

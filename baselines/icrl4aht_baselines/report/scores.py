@@ -420,7 +420,7 @@ class Headline(NamedTuple):
         parts.append(f"return {self.mean.text()}")
         parts += [f"in episodes {self.blocks}"] if self.blocks else []
         text = f"{self.label} ({self.protocol}), {self.tasks}: {'; '.join(parts)}."
-        text += " Ranges in parentheses: 95 % intervals." if self.mean.range() else ""
+        text += " Ranges in parentheses: 95 % intervals." if self.mean.interval_text() else ""
         return f"{text} {self.why_no_score}".rstrip()
 
 

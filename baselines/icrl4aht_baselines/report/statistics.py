@@ -39,13 +39,13 @@ class MeanInterval(NamedTuple):
     high: float = float("nan")
     p: float = float("nan")
 
-    def range(self, digits: int = 1, sign: str = "") -> str:
+    def interval_text(self, digits: int = 1, sign: str = "") -> str:
         """Return the interval as text, such as "(0.1 to 0.4)", or an empty string if there is no interval."""
         return "" if np.isnan(self.low) else f"({self.low:{sign}z.{digits}f} to {self.high:{sign}z.{digits}f})"
 
     def text(self, digits: int = 1, sign: str = "") -> str:
         """Return mean and interval as text, with a sign before positive numbers if `sign` is "+"."""
-        return f"{self.mean:{sign}z.{digits}f} {self.range(digits, sign)}".rstrip()
+        return f"{self.mean:{sign}z.{digits}f} {self.interval_text(digits, sign)}".rstrip()
 
 
 class Stratum(NamedTuple):

@@ -108,6 +108,6 @@ class CollectionJob:
             publish_artefact(partial, self.folder)
 
     def finished_text(self) -> str:
-        """Return a message that the artefact is finished, with the speed if known."""
+        """Return a message which says that the artefact is finished, and the speed if known."""
         progress = self.progress()
         return f"finished at {progress[1]:,.0f} steps/s" if progress else "finished"

@@ -70,7 +70,7 @@ def stack_facts(layouts: Sequence[Layout]) -> LayoutFacts:
 def compute_layout_facts(layout: Layout) -> LayoutFacts:
     """Compute the `LayoutFacts` of one layout."""
     kinds, tables = layout.kinds, layout.tables
-    # An agent reaches the cells that it can face, so both agents reach a counter between their rooms.
+    # An agent can use every cell that it can face, so both agents can use a counter between their rooms.
     mine, theirs = (np.isin(np.arange(layout.cells), layout.ahead[room]) for room in layout.rooms)
     shared = mine & theirs
     cells = np.array(layout.pots, int)

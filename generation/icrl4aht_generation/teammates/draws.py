@@ -167,7 +167,7 @@ def drawn_teammates(
     if count > available:
         raise OptionError(
             f"{name}: {count} {_OF_SEED[base_seed]} teammates requested from {', '.join(families) or 'no family'}, "
-            f"expected at most {available}, the number of distinct draws; request fewer, or name more families "
+            f"but there are only {available} distinct draws; request fewer, or name more families "
             f"({_usable_text(name, base_seed)})"
         )
     turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]

@@ -68,7 +68,8 @@ def build_learned_entry(layout: Layout, teammate: dict[str, Any], suite: Path | 
     """
     if suite is None:
         raise OptionError(
-            f"teammate {teammate['theta']['checkpoint']} is a checkpoint: give the folder of its suite as `suite`"
+            f"teammate {teammate['theta']['checkpoint']} is loaded from a checkpoint: give the folder of its suite as "
+            "`suite`"
         )
     folder = checkpoint_folder(suite, teammate)
     policy = build_learned(layout, folder)

@@ -29,6 +29,7 @@ from icrl4aht_data.benchmark.adaptation import EGO_KINDS, SCRIPTS, adaptation_ta
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE, PREFERENCE_LAYOUTS
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.utils.text import card_file
 from tests.helpers.paths import ROOT
 
@@ -90,10 +91,17 @@ def test_best_response_is_chosen_on_separate_episodes(tmp_path):
     responses.write_responses([], tmp_path, {"worse": models["worse"]})
     (fourth,) = read_best_responses(path).behaviours
     assert (fourth.best, fourth.agent) == (9.0, "best response, seed 0")
+    second_job = ResponseJob((DEMO[2],), 0, TINY, tmp_path / "second")
+    write_finished_job(second_job, choice=1.0, earned=1.0)
+    for own in ([second_job], jobs):
+        responses.write_responses(own, tmp_path)
+    order = [one.tasks for one in read_best_responses(path).behaviours]
+    assert order == [(DEMO[0].task_id,), (DEMO[2].task_id,)], "the new entry is where the earlier one was"
     pair = ResponseJob((DEMO[0], DEMO[1]), 0, TINY, tmp_path / "pair")
     write_finished_job(pair, choice=1.0, earned=1.0)
     responses.write_responses([pair], tmp_path)
-    assert [one.tasks for one in read_best_responses(path).behaviours] == [(DEMO[0].task_id, DEMO[1].task_id)]
+    order = [one.tasks for one in read_best_responses(path).behaviours]
+    assert order == [(DEMO[2].task_id,), (DEMO[0].task_id, DEMO[1].task_id)]
     other = ResponseJob(behaviour, 0, replace(TINY, steps=800), tmp_path)
     assert not other.is_finished()  # the stored result has other settings
 
@@ -114,7 +122,21 @@ def test_headroom_table_shows_mean_difference_and_interval(tmp_path):
     assert entry["interval"] == [-7.706, 17.706]
     assert adaptation_table([entry]).splitlines()[-1] == row
     write_adaptation([job for job in jobs if job.seed == 0], tmp_path)
-    assert read_adaptation(tmp_path) == [entry], "a measurement with fewer seeds does not replace the stored one"
+    assert read_adaptation(tmp_path) == [entry], "the stored return of the other seed is kept"
+    (tmp_path / "adaptation.json").unlink()
+    for seed in (1, 0):
+        write_adaptation([job for job in jobs if job.seed == seed], tmp_path)
+    assert read_adaptation(tmp_path) == [entry], "seeds that are measured one after the other count together"
+    write_adaptation([replace(job, options=replace(TINY, width=64)) for job in jobs[:2]], tmp_path)
+    assert read_adaptation(tmp_path) == [entry], "no job of the other width is finished"
+    narrow = entry | {"width": 64, "returns": {kind: {"7": 0.0} for kind in EGO_KINDS}}
+    write_json(tmp_path / "adaptation.json", [narrow])
+    write_adaptation(jobs, tmp_path)
+    assert read_adaptation(tmp_path) == [entry], "seeds of another width are replaced by a larger number of seeds"
+    write_json(tmp_path / "adaptation.json", [entry | {"steps": 800}])
+    write_adaptation(jobs[:2], tmp_path)
+    assert read_adaptation(tmp_path) == [entry | {"steps": 800}], "one seed with other steps does not replace two"
+    write_json(tmp_path / "adaptation.json", [entry])
     write_adaptation(adaptation_jobs({"other": DEMO[2:3]}, 1, TINY, tmp_path), tmp_path)
     assert read_adaptation(tmp_path) == [entry], "no job of the other set is finished"
 

@@ -75,7 +75,7 @@ def test_teammates_with_equal_behaviour_count_as_one_unit():
     pair = [scores.find_score({WIDE: of}, [WIDE], alike) for of in (found, one)]
     assert pair[0] and pair[1] is None
     single = scores.find_score({WIDE: one}, [WIDE], {WIDE: cell_scale((0.0, 20.0, "same"))})
-    assert single and single.total == pytest.approx(pair[0].total) and pair[0].total.range()
+    assert single and single.total == pytest.approx(pair[0].total) and pair[0].total.interval_text()
 
 
 def test_seeds_are_resampled_if_one_behaviour_has_headroom():

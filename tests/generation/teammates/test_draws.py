@@ -80,7 +80,7 @@ def test_chosen_draws_differ_from_test_teammates_of_their_family(layout):
         teammates = drawn_teammates(layout, families, len(headroom or usable), seed)
         assert {found for _, found in teammates} == {*(headroom or usable)}
         assert all(found.distance >= 0.02 for _, found in teammates)
-        with pytest.raises(OptionError, match=r"expected at most \d+, the number of distinct draws; request fewer"):
+        with pytest.raises(OptionError, match=r"but there are only \d+ distinct draws; request fewer"):
             drawn_teammates(layout, families, len(teammates) + 1, seed)
         for family in {*HEURISTIC_FAMILIES} - {*families}:
             with pytest.raises(OptionError, match=rf"{layout}: no usable (drawn|diverse) \w+ teammates of {family}: "):

@@ -69,7 +69,7 @@ def _choose_action(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Boo
             Rule(runner & empty, scene.piles_of(scene.needed - coming > 0)),
             Rule(plater & plate, scene.cooked),
             Rule(plater & empty, scene.plate_piles),
-            # By the remaining rules, agents without a possible task go to the target of their next task and wait.
+            # The remaining rules send an agent that can do nothing now to the target of its next task, where it waits.
             Rule(plater & (plate | empty), scene.pots_in_use, waits=True),
             Rule((runner & empty) | (plater & plate), scene.pots, waits=True),
             Rule(empty | (plater & plate), scene.buttons, waits=True),

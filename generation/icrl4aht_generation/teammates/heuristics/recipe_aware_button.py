@@ -90,7 +90,7 @@ def _choose_action(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[
     fetches_plate &= ~(second & _should_leave_plates(scene))
     cooks = empty & ~delivers_only
     errs = cooks & (u[1] < params["wrong_ingredient_prob"]) & (jnp.max(ids) > 0)
-    right = _right_ingredient(scene, params, recipe, second)
+    right = _ingredient_to_fetch(scene, params, recipe, second)
     first_rules = [
         Rule(dish & cooks_only, scene.empty_counters),
         Rule(dish & ~cooks_only, scene.goals),
@@ -153,7 +153,7 @@ def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
     return jnp.where(jnp.any(wanting) & ~wanted_everywhere, wanting, scene.fillable_pot_cells)
 
 
-def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], second: Array) -> Int[Array, ""]:
+def _ingredient_to_fetch(scene: Scene, params, recipe: UInt8[Array, ""], second: Array) -> Int[Array, ""]:
     """Return the id of the ingredient to fetch, or -1; on a cramped layout, the agents fetch different ingredients."""
     ids = jnp.asarray(scene.tables.ingredients)
     missing = _missing_ingredients(scene, recipe).sum(axis=0) > 0
