@@ -61,7 +61,8 @@ RESPONSES_FILE = "best_responses.json"
 
 ABOUT = (
     "Best responses are recurrent PPO agents with the benchmark's view. Each is trained with one teammate, with memory "
-    "cleared before each episode, and imitates the oracle in the first half of the training. Episodes of seed "
+    "cleared before each episode, and imitates the oracle in the first half of the training. Some runs start from the "
+    "parameters of a bundled model. Episodes of seed "
     f"{CHOICE_SEEDS[0]} decide between training runs. Returns are means over tasks and the seeds "
     f"{', '.join(map(str, REPORT_SEEDS))}. For each of these seeds, the stored model that earns most with the other "
     "two is used instead if it earns more with them. On the track `preference`, best responses are informed egos, "
