@@ -60,7 +60,9 @@ SPAN = 20.0
 
 
 def write_invented_responses(path: Path, preference: bool = False) -> Path:
-    """Write invented best responses to all teammates of test tasks; a layout's five H4 teammates share a response.
+    """Write invented best responses to all teammates of test tasks, and of the validation tasks on demo_wide.
+
+    A layout's five H4 teammates share a response.
 
     Args:
         preference: whether the test tasks of the track `preference` also have best responses.
@@ -72,6 +74,9 @@ def write_invented_responses(path: Path, preference: bool = False) -> Path:
             best = float(np.mean([stays[task.task_id] for task in own])) + SPAN * has_headroom(egos)
             ids, trained = tuple(task.task_id for task in own), (TrainingRun(1, 10, best),)
             behaviours.append(BestResponse(layout, family, "test", ids, trained, best, "best response, seed 1"))
+    for task in (task for task in bundled_tasks("teammate", "validation") if task.layout.name == "demo_wide"):
+        names, best = ("demo_wide", task.teammate_family, "validation", (task.task_id,)), stays[task.task_id] + SPAN
+        behaviours.append(BestResponse(*names, (TrainingRun(1, 10, best),), best, "best response, seed 1"))
     for task in bundled_tasks(PREFERENCE, "test") if preference else ():
         names, best = (task.layout.name, task.teammate_family, "test", (task.task_id,)), stays[task.task_id] + SPAN
         behaviours.append(BestResponse(*names, (TrainingRun(0, 10, best, tasks=2),), best, "informed ego, seed 0"))

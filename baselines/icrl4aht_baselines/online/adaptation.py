@@ -196,9 +196,9 @@ def _seed_interval(returns: Mapping[str, Mapping[str, float]]) -> list[float] | 
 
 
 def _with_stored_seeds(entry: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a new entry together with the stored entry's other seeds if both have equal settings.
+    """Return a new entry together with the stored entry's other seeds if both have as many tasks, steps and units.
 
-    With other settings the entry that has more seeds is returned, or the new one if both have the same number.
+    Otherwise the entry that has more seeds is returned, or the new one if both have the same number.
     """
     if any(entry[name] != stored[name] for name in ("number", "steps", "width")):
         return entry if len(entry["returns"]["informed"]) >= len(stored["returns"]["informed"]) else dict(stored)
@@ -210,7 +210,7 @@ def _with_stored_seeds(entry: dict[str, Any], stored: Mapping[str, Any]) -> dict
 def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
     """Add the measurements of finished jobs to a folder's file `ADAPTATION`. Return the file's path.
 
-    Stored returns of other seeds are kept if the settings are equal. A Markdown file of the same name gets a table of
+    Stored returns of other seeds are kept as in `_with_stored_seeds`. A Markdown file of the same name gets a table of
     all entries.
     """
     path = folder / ADAPTATION

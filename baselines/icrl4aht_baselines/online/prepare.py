@@ -260,8 +260,8 @@ def _rearranged_tasks(
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
     """Return the relative number of tasks on each layout: 1, or `FLAT_SHARE` if measured egos earn about the same.
 
-    A layout gets 1 if the measured returns of egos with one of its teammates differ by `LEAST_HEADROOM` or more, or if
-    one of its teammates was not measured.
+    A layout gets 1 if the measured returns of egos with one of its teammates differ by `LEAST_HEADROOM` or more (with
+    drawn teammates those of `stay` and the oracle), or if one of its teammates was not measured.
     """
     matters: dict[str, bool] = defaultdict(bool)
     for task in tasks:

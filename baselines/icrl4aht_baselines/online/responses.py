@@ -65,7 +65,8 @@ ABOUT = (
     "parameters of a bundled model. Episodes of seed "
     f"{CHOICE_SEEDS[0]} decide between training runs. Returns are means over tasks and the seeds "
     f"{', '.join(map(str, REPORT_SEEDS))}. For each of these seeds, the stored model that earns most with the other "
-    "two is used instead if it earns more with them. On the track `preference`, best responses are informed egos, "
+    "two is used instead if it earns more with them; in validation tasks, models are not compared. "
+    "On the track `preference`, best responses are informed egos, "
     "which observe the task's number."
 )
 

@@ -446,16 +446,14 @@ def describe_training_runs() -> str:
     trained = [training for one in behaviours for training in one.seeds]
     if not trained:
         return ""
-    steps, width = (
-        _format_range([one.steps for one in trained], ",d"),
-        _format_range([one.width for one in trained], "d"),
-    )
+    steps = _format_range([one.steps for one in trained], ",d")
+    width, started = _format_range([one.width for one in trained], "d"), sum(bool(one.init) for one in trained)
     models = sum(not one.agent.startswith("best response") for one in behaviours)
     runs = _format_range([len(one.seeds) for one in behaviours], "d")
     return (
-        f"For each of {len(behaviours)} behaviours a best response was trained in {runs} "
-        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. For {models} of them a stored "
-        f"model was chosen instead."
+        f"Each of {len(behaviours)} behaviours of published test teammates has {runs} training "
+        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}; {started} runs started from a "
+        f"bundled model. For {models} behaviours a stored model was chosen instead."
     )
 
 

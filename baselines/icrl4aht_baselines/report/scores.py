@@ -34,6 +34,7 @@ from icrl4aht_baselines.report.results import (
     task_label,
 )
 from icrl4aht_baselines.report.statistics import (
+    LEAST_UNITS,
     MeanInterval,
     Stratum,
     interquartile_mean,
@@ -42,7 +43,7 @@ from icrl4aht_baselines.report.statistics import (
 )
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.best_responses import best_responses, read_best_responses
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, LEAST_HEADROOM, PREFERENCE, TRACKS
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LAYOUT_NAMES, LEAST_HEADROOM, PREFERENCE, TRACKS
 from icrl4aht_data.benchmark.reference_returns import (
     has_headroom,
     read_reference_returns,
@@ -277,7 +278,7 @@ def _strata_by_layout(
 def stratum_of_behaviours(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
     """Return a stratum for the bootstrap, with behaviours as units, or seeds.
 
-    Units are seeds if fewer than two behaviours have scales above a tenth of the mean scale.
+    Units are seeds if fewer than `LEAST_UNITS` behaviours have scales above a tenth of the mean scale.
 
     Args:
         values: numerators of the tasks, of shape (T, U, S).
@@ -286,7 +287,8 @@ def stratum_of_behaviours(values: np.ndarray, scales: np.ndarray, behaviours: Se
     """
     names, seeds = list(dict.fromkeys(behaviours)), values.shape[2]
     # A resample of behaviours without the only one with headroom would have a denominator of about 0.
-    if len({name for name, scale in zip(behaviours, scales, strict=True) if scale > 0.1 * scales.mean()}) < 2:
+    scaled = {name for name, scale in zip(behaviours, scales, strict=True) if scale > 0.1 * scales.mean()}
+    if len(scaled) < LEAST_UNITS:
         return Stratum(values.sum(axis=1) / seeds, np.full(seeds, scales.sum() / seeds))
     member = np.array([[name == own for name in names] for own in behaviours], float)
     return Stratum(np.moveaxis(values.mean(axis=2)[..., None] * member, 1, -1).sum(axis=-1), scales @ member)
@@ -425,15 +427,19 @@ class Headline(NamedTuple):
 
 
 def find_headlines(run: EvaluationRun) -> list[Headline]:
-    """Return a summary of a run for each kind of task that was played, with test tasks first."""
+    """Return a summary of a run for each kind of task that was played, with test tasks first.
+
+    Validation tasks on published layouts and on other layouts have separate summaries.
+    """
     scales, found = cell_scales(run.protocol), []
-    for kind in TASK_KINDS:
-        played = [cell for cell in run.returns if cell.kind == kind]
+    # Validation tasks have scores only on published layouts, so those on other layouts have a summary of their own.
+    groups = grouped(run.returns, lambda cell: (cell.kind, cell.kind == "validation" and cell.layout in LAYOUT_NAMES))
+    for kind, is_published in sorted(groups, key=lambda key: ([*TASK_KINDS].index(key[0]), not key[1])):
+        played = groups[kind, is_published]
         scored = scored_cells(run, played, scales)
-        if not played:
-            continue
         cells = scored or played
         returns, counted = [run.returns[cell] for cell in cells], counted_noun(len(cells), f"{kind} cell")
+        counted += " on other layouts" if kind == "validation" and not is_published else ""
         overlaps = run.overlaps(cells)
         found.append(
             Headline(

@@ -3,7 +3,7 @@
 Intervals are studentized bootstrap intervals (Efron and Tibshirani 1993, ch. 12.5). With five teammates, percentile
 intervals would be too narrow by a tenth, since the variance of resamples is (n - 1) / n of the true variance; dividing
 by the standard error of each resample corrects this. Teammates' behaviours are resampled within a combination of layout
-and family, or the seeds if fewer than two behaviours have headroom. Training runs are resampled for all combinations
+and family, or the seeds if fewer than three behaviours have headroom. Training runs are resampled for all combinations
 together. The random generator has a fixed seed, so that results are reproducible.
 
 Shapes: T training runs, U units of a stratum (behaviours, or seeds), S seeds, R resamples.
@@ -20,6 +20,9 @@ from scipy.stats import bootstrap, trim_mean
 
 _RESAMPLES = 4000
 _LEAST_FREEDOM = 3  # with fewer degrees of freedom, too many resamples are equal
+
+LEAST_UNITS = 3
+"""Least number of units that are resampled: half of the resamples of two units have variance 0."""
 
 _Key = TypeVar("_Key", bound=Hashable)
 
@@ -74,15 +77,19 @@ def stratum_of_values(values: Float[np.ndarray, "T U ..."]) -> Stratum:
     """Return a stratum for the mean of values: its denominators are 1, so that its ratio is this mean.
 
     Args:
-        values: float64 of shape (T, U) or (T, U, S).
+        values: float64 of shape (T, U) or (T, U, S). If U is less than `LEAST_UNITS`, the S values of a unit are
+            resampled instead.
     """
     values = values.reshape(*values.shape[:2], -1)
-    units = values.mean(axis=2) if values.shape[1] > 1 else values[:, 0]
+    units = values.mean(axis=2 if values.shape[1] >= LEAST_UNITS else 1)
     return Stratum(units, np.ones(units.shape[1]))
 
 
 def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMPLES) -> MeanInterval:
     """Return the mean over groups of the ratio sum(gains) / sum(scales), with its 95 % interval.
+
+    There is no interval if there are too few units: fewer than three degrees of freedom, or only one unit in most
+    strata and at most three training runs.
 
     Args:
         groups: strata of each group, at least one; all strata have the same training runs.
@@ -92,7 +99,8 @@ def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMP
     trainings = groups[0][0].gains.shape[0]
     (mean,), (variance,) = _estimate(strata, np.full((1, trainings), 1 / trainings))
     freedom = sum(len(stratum.scales) - 1 for group in groups for stratum in group) + trainings - 1
-    if freedom < _LEAST_FREEDOM:
+    several = [len(stratum.scales) > 1 for group in groups for stratum in group]
+    if freedom < _LEAST_FREEDOM or (trainings <= _LEAST_FREEDOM and np.mean(several) < 0.5):
         return MeanInterval(float(mean))
     if variance < 1e-18:  # all units have the same ratio
         return MeanInterval(*[float(mean)] * 3, p=float(abs(mean) < 1e-9))

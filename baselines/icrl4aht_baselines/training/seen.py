@@ -86,7 +86,7 @@ OVERLAPS = {
         "the agent was trained with other teammates of this family, or of this algorithm if they are learned; members "
         "of a family may act alike, so this score does not show how the agent plays with unknown kinds of teammates",
     ),
-    "layout": ("§", "the agent was trained on this layout, which the track reserves for tests"),
+    "layout": ("§", "the agent was trained on this layout, which the track uses only for tests"),
     "unknown": ("?", "unknown training data: nothing says what the agent was trained on"),
 }
 """Kind of overlap of training data and evaluated tasks -> its mark behind a score, and the meaning of the mark."""

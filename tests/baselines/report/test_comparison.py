@@ -172,6 +172,12 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
     mixed = table[table["control"] == "swapped"]
     assert set(mixed.loc[mixed["best"].notna(), "block"]) == {"last 20"}, "others have another teammate"
     assert "20 of 32 cells" in comparison.render_comparison(some)
+    panels, make = [], comparison.panel_grid
+    monkeypatch.setattr(
+        comparison, "panel_grid", lambda layouts, *options: panels.append(layouts) or make(layouts, *options)
+    )
+    comparison.plot_comparison(some, tmp_path / "again.png")
+    assert panels == [["coord_ring", "test_wide", "demo_simple", "demo_wide", "asymm_right", "cramped_down"]]
 
 
 @pytest.mark.parametrize("texts", ["{", "[]", '{"a": {}}', "{}"])

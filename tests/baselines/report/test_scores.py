@@ -7,6 +7,7 @@ from io import StringIO
 import numpy as np
 import pandas as pd
 import pytest
+from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 from icrl4aht_baselines.report import page, scores
 from icrl4aht_baselines.report.results import BLOCKS, CellReturns, ResultCell, task_label
 from icrl4aht_baselines.report.scores import CellScale, TaskScale
@@ -78,20 +79,23 @@ def test_teammates_with_equal_behaviour_count_as_one_unit():
     assert single and single.total == pytest.approx(pair[0].total) and pair[0].total.interval_text()
 
 
-def test_seeds_are_resampled_if_one_behaviour_has_headroom():
-    """Without its only behaviour with headroom, a resample would have no scale: units are the seeds then."""
+def test_seeds_are_resampled_if_fewer_than_three_behaviours_have_headroom():
+    """Many resamples of behaviours would have no scale or no variance: units are the seeds then."""
     values, names = np.arange(15.0).reshape(1, 5, 3), list("abcde")
-    one = scores.stratum_of_behaviours(values, np.array([0.0, 0.0, 30.0, 0.1, 0.0]), names)
-    assert one.gains.shape == (1, 3) and one.scales.tolist() == pytest.approx([30.1 / 3] * 3)
-    two = scores.stratum_of_behaviours(values, np.array([0.0, 0.0, 30.0, 20.0, 0.0]), names)
-    assert two.gains.shape == (1, 5) and two.scales.tolist() == [0.0, 0.0, 30.0, 20.0, 0.0]
+    for scales in ([0.0, 0.0, 30.0, 0.1, 0.0], [0.0, 10.0, 20.0, 0.1, 0.0]):
+        few = scores.stratum_of_behaviours(values, np.array(scales), names)
+        assert few.gains.shape == (1, 3) and few.scales.tolist() == pytest.approx([30.1 / 3] * 3)
+    three = scores.stratum_of_behaviours(values, np.array([0.0, 10.0, 30.0, 20.0, 0.0]), names)
+    assert three.gains.shape == (1, 5) and three.scales.tolist() == [0.0, 10.0, 30.0, 20.0, 0.0]
 
 
 def test_tasks_of_a_layout_of_track_preference_form_one_stratum():
     """On other tracks, each cell is a stratum."""
-    parts = [(np.full((1, 1, 3), value), np.array([20.0]), [name]) for value, name in ((1.0, "a"), (9.0, "b"))]
-    for kind, shapes in ((PREFERENCE, [(1, 2)]), ("test", [(1, 3), (1, 3)])):
-        cells = [ResultCell("rooms-0-46", family, kind) for family in ("H1", "H2")]
+    parts = [
+        (np.full((1, 1, 2), value), np.array([20.0]), [name]) for value, name in ((1.0, "a"), (9.0, "b"), (5.0, "c"))
+    ]
+    for kind, shapes in ((PREFERENCE, [(1, 3)]), ("test", [(1, 2)] * 3)):
+        cells = [ResultCell("rooms-0-46", family, kind) for family in ("H1", "H2", "H3")]
         assert [stratum.gains.shape for stratum in scores._pooled_strata(cells, parts).values()] == shapes
 
 
@@ -113,7 +117,7 @@ def test_score_scales_cover_all_tasks_with_a_best_response(invented_responses):
         and RING in scores.cells_with_headroom(scales)
         and scores.cell_scales("published") == {}
     )
-    assert all(len(scale.tasks) == 5 for scale in scales.values())
+    assert all(len(scale.tasks) == 5 for cell, scale in scales.items() if cell.kind == "test")
     assert len({task.behaviour for task in scales[ResultCell("demo_wide", "H4")].tasks.values()}) == 1
     assert {*scales[WIDE].tasks} == {task_label(task) for task in scores.bundled_ids_by_cell()[WIDE]}
 
@@ -140,6 +144,16 @@ def test_summary_of_a_run_has_score_and_return_by_episode(invented_responses):
         "worst teammate 0.55 (demo_wide H1), regret 9.0; return 11.0 (11.0 to 11.0); in episodes 1: 10.0, 2-5: 10.0, "
         "6-20: 10.0, 21-100: 12.0. Ranges in parentheses: 95 % intervals."
     )
+
+
+def test_validation_tasks_on_published_and_on_other_layouts_have_separate_summaries(invented_responses):
+    """Validation tasks of the track `preference` have no best responses."""
+    own = [task for task in bundled_tasks("teammate", "validation") if task.layout.name == "demo_wide"]
+    scored, other = scores.find_headlines(
+        evaluated_run("mine", tasks=[*own, *bundled_tasks(PREFERENCE, "validation")[:1]])
+    )
+    assert scored.score and scored.tasks == "2 validation cells with headroom, of 2 played"
+    assert (other.score, other.tasks) == (None, "1 validation cell on other layouts")
 
 
 def test_results_without_a_score_have_a_reason(invented_responses):

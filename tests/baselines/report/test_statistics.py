@@ -36,6 +36,13 @@ def test_equal_values_give_a_point_interval_and_too_few_values_give_nan():
     assert MeanInterval(-0.01, -0.2, 0.3).text(sign="+") == "+0.0 (-0.2 to +0.3)"
 
 
+def test_interval_is_missing_if_most_strata_have_one_unit():
+    """The single units' variance is unknown, so an interval would be too narrow."""
+    several, single = Stratum(np.arange(4.0)[None], np.ones(4)), Stratum(np.ones((1, 1)), np.ones(1))
+    assert np.isnan(ratio_interval([[several], [single], [single]]).low)
+    assert np.isfinite(ratio_interval([[several], [single]]).low)
+
+
 def test_intervals_resample_instances_but_not_groups():
     """Compare intervals of 15 values: one per instance, three seeds of five instances, and 15 seeds of one instance."""
     values = np.linspace(-1, 1, 15)
