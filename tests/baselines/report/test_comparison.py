@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import gzip
+import lzma
 
 import numpy as np
 import pandas as pd
@@ -186,14 +186,24 @@ def test_damaged_stored_results_raise_error(texts, tmp_path):
         comparison.read_stored(tmp_path / "none.json")
     (tmp_path / "bad.json").write_text(texts)
     (tmp_path / "bad.csv").write_text("agent,protocol\n")
-    with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*this file, bad\.csv\.gz and bad_curves"):
+    with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*this file, bad\.csv\.xz and bad_curves"):
         comparison.read_stored(tmp_path / "bad.json")
+
+
+@pytest.mark.parametrize("part", [slice(40), slice(10, None)])
+def test_damaged_tables_of_stored_results_raise_error(part, stored, tmp_path):
+    """A table is cut at its end or its start."""
+    comparison.write_stored(tmp_path / "cut.json", stored)
+    path = tmp_path / "cut.csv.xz"
+    path.write_bytes(path.read_bytes()[part])
+    with pytest.raises(OptionError, match=r"cut\.json: not stored results: .*restore this file, cut\.csv\.xz"):
+        comparison.read_stored(tmp_path / "cut.json")
 
 
 def test_bundled_results_are_unchanged_if_written_again(tmp_path):
     comparison.write_stored(tmp_path / "results.json", comparison.read_stored(comparison.results_file()))
-    for name in ("results.json", "results.csv.gz", "results_curves.csv.gz"):
-        opened = gzip.open if name.endswith(".gz") else open
+    for name in ("results.json", "results.csv.xz", "results_curves.csv.xz"):
+        opened = lzma.open if name.endswith(".xz") else open
         with opened(tmp_path / name) as written, opened(comparison.results_file().with_name(name)) as bundled:
             assert written.read() == bundled.read()
 
