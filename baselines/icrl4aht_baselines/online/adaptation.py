@@ -196,9 +196,10 @@ def _seed_interval(returns: Mapping[str, Mapping[str, float]]) -> list[float] | 
 
 
 def _with_stored_seeds(entry: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a new entry together with the stored entry's other seeds if both have as many tasks, steps and units.
+    """Return a new entry together with the stored entry's other seeds.
 
-    Otherwise the entry that has more seeds is returned, or the new one if both have the same number.
+    If the number of tasks, the steps or the widths differ, return the entry with more seeds, or the new one if both
+    have the same number of seeds.
     """
     if any(entry[name] != stored[name] for name in ("number", "steps", "width")):
         return entry if len(entry["returns"]["informed"]) >= len(stored["returns"]["informed"]) else dict(stored)
@@ -210,8 +211,8 @@ def _with_stored_seeds(entry: dict[str, Any], stored: Mapping[str, Any]) -> dict
 def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
     """Add the measurements of finished jobs to a folder's file `ADAPTATION`. Return the file's path.
 
-    Stored returns of other seeds are kept as in `_with_stored_seeds`. A Markdown file of the same name gets a table of
-    all entries.
+    Stored returns of other seeds are kept if the number of tasks, the steps and the width are equal. Otherwise the
+    entry with more seeds is kept. A Markdown file of the same name gets a table of all entries.
     """
     path = folder / ADAPTATION
     known = {entry["tasks"]: entry for entry in read_adaptation(folder)}

@@ -65,9 +65,8 @@ ABOUT = (
     "parameters of a bundled model. Episodes of seed "
     f"{CHOICE_SEEDS[0]} decide between training runs. Returns are means over tasks and the seeds "
     f"{', '.join(map(str, REPORT_SEEDS))}. For each of these seeds, the stored model that earns most with the other "
-    "two is used instead if it earns more with them; in validation tasks, models are not compared. "
-    "On the track `preference`, best responses are informed egos, "
-    "which observe the task's number."
+    "two is used instead if it earns more with them; in validation tasks, models are not compared. On the track "
+    "`preference`, best responses are informed egos, which observe the task's number."
 )
 
 PLAY = PlayOptions(task_end=1.0)
@@ -348,9 +347,8 @@ def add_responses(found: Sequence[BestResponse], folder: Path, models: Mapping[s
     """Add best responses to the file `RESPONSES_FILE` in a folder. Return the file's path.
 
     Earlier entries that share tasks with the new ones are removed, and a new entry takes the place of one with the same
-    tasks. For all entries, `include_models` chooses between
-    trained egos and stored models. The version in the file is a hash of all entries. A Markdown file of the same name
-    gets a table of all entries.
+    tasks. For all entries, `include_models` chooses between trained egos and stored models. The version in the file is
+    a hash of all entries. A Markdown file of the same name gets a table of all entries.
     """
     path, new = folder / RESPONSES_FILE, {one.tasks: one for one in found}
     played = {task for tasks in new for task in tasks}
@@ -367,8 +365,8 @@ def responses_table(folder: Path) -> str:
     """Return a Markdown table of a folder's best responses.
 
     On the track `preference`, column "teammates" also has the ingredient ids of the wanted dish. Column "B" is the best
-    return. Column "rise" is the `slope` of the best training run; a `slope` well above 0
-    shows that the training was too short.
+    return. Column "rise" is the `slope` of the best training run; a `slope` well above 0 shows that the training was
+    too short.
     """
     body = []
     dishes = {task.task_id: task.recipes for task in bundled_tasks(PREFERENCE, "test")}

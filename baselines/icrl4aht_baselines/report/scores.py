@@ -433,13 +433,15 @@ def find_headlines(run: EvaluationRun) -> list[Headline]:
     """
     scales, found = cell_scales(run.protocol), []
     # Validation tasks have scores only on published layouts, so those on other layouts have a summary of their own.
-    groups = grouped(run.returns, lambda cell: (cell.kind, cell.kind == "validation" and cell.layout in LAYOUT_NAMES))
-    for kind, is_published in sorted(groups, key=lambda key: ([*TASK_KINDS].index(key[0]), not key[1])):
-        played = groups[kind, is_published]
+    groups = grouped(
+        run.returns, lambda cell: (cell.kind, cell.kind == "validation" and cell.layout not in LAYOUT_NAMES)
+    )
+    for kind, is_other in sorted(groups, key=lambda key: ([*TASK_KINDS].index(key[0]), key[1])):
+        played = groups[kind, is_other]
         scored = scored_cells(run, played, scales)
         cells = scored or played
         returns, counted = [run.returns[cell] for cell in cells], counted_noun(len(cells), f"{kind} cell")
-        counted += " on other layouts" if kind == "validation" and not is_published else ""
+        counted += " on other layouts" if is_other else ""
         overlaps = run.overlaps(cells)
         found.append(
             Headline(

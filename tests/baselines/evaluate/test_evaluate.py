@@ -163,7 +163,7 @@ def test_out_of_range_action_of_host_agent_raises_error():
     ],
 )
 def test_host_agent_actions_of_wrong_shape_or_type_raise_errors(actions, message):
-    """Call the policy without the environment, whose step takes seconds to compile."""
+    """The test calls the policy directly, because compiling the environment takes seconds."""
     policy, keys = from_host(HostRecorder(lambda batch: actions))(LAYOUTS["coord_simple"]), jnp.zeros(1, jnp.uint32)
     ego_input = EgoInput(jnp.zeros((1, 5, 5, 40)), *[jnp.zeros(1)] * 4)
     memory = policy.init((), keys)

@@ -162,7 +162,7 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
     text = paths[0].read_text(encoding="utf-8")
     assert f"no ego can raise the return.\n\n{published_adaptation_table({})}\n" in text
     assert "| `high` | noise | oracle | 10 updates, 2 core-hours | – |" in text and "| `low`" not in text
-    assert "lists them (version 0)" in text
+    assert "`low`" not in text and "lists them (version 0)" in text
     assert paths[1].stat().st_size > 10_000
     assert len(pd.read_parquet(paths[3])) == len(stored.table)
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: responses_folder / "measured.json")
