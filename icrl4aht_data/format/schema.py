@@ -261,17 +261,15 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return -(-self.rows(field) // field.chunk)
 
     def to_json(self) -> dict[str, Any]:
-        """Return this entry as a JSON object; `label_view` and `teammate_of_episode` are left out if they are None."""
+        """Return this entry as a JSON object without fields that are None, except `h5_row`, which has no default."""
         content = json.loads(msgspec.json.encode(self))
-        return {name: value for name, value in content.items() if value is not None or name not in _LEFT_OUT}
+        return {name: value for name, value in content.items() if value is not None or name == "h5_row"}
 
     def to_row(self) -> dict[str, Any]:
         """Return the fields of this entry as a row of a table, with `teammate_of_episode` as JSON text."""
         texts = {name: as_json(getattr(self, name)) for name in ENCODED}
         return msgspec.structs.asdict(self) | {"obs_shape": list(self.obs_shape)} | texts
 
-
-_LEFT_OUT = ("label_view", "teammate_of_episode")  # omitted if None, as in old indexes
 
 ENTRY_HINTS: dict[str, Any] = get_type_hints(Entry)
 """Types of the fields of an index line by name, without bounds."""

@@ -13,7 +13,10 @@ from icrl4aht_generation.learners.resume import BusyError
 
 @dataclass(frozen=True)
 class FileJob:
-    """A job that writes its process id to a file, after failing in its first `failures` attempts."""
+    """A job that writes its process id to a file, after failing in its first `failures` attempts.
+
+    The file has the value of the environment variable `variable` instead, if it is given.
+    """
 
     out: Path
     name: str
@@ -23,6 +26,7 @@ class FileJob:
     updates: int = 1
     xla_threads: int | None = 1
     is_quick: bool = True
+    variable: str = ""
 
     @property
     def label(self) -> str:
@@ -46,4 +50,4 @@ class FileJob:
             raise ValueError(f"attempt {len(tries.read_text())}")
         if self.killed:
             os.kill(os.getpid(), signal.SIGKILL)
-        (self.out / self.name).write_text(str(os.getpid()))
+        (self.out / self.name).write_text(os.environ[self.variable] if self.variable else str(os.getpid()))

@@ -258,7 +258,7 @@ def submit_command(
     """Make a file of results for the page that `results` writes.
 
     Each FOLDER was written by `evaluate`, under the protocol `seeded`, with the seeds 0, 1 and 2. Together the folders
-    must hold all test tasks of a track, or of both tracks, and state what the agent was trained on. Give several
+    must hold all test tasks of one track or more, and state what the agent was trained on. Give several
     folders for tracks, or training runs, that were evaluated separately. Results of `evaluate --controls` are included.
     Results with a model's other way of choosing actions, such as `evaluate --sampled`, are shown in separate rows. A
     pull request that adds the file puts the agent on the page; `icrl4aht-data results FILE` shows a preview.

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import sys
 import traceback
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor
 from concurrent.futures import wait as wait_for
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import current_thread, main_thread
 from typing import Any
 
+import jax
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from rich.console import Console
 
 from icrl4aht_data.utils.progress import progress_bars
@@ -33,6 +37,7 @@ from icrl4aht_generation.jobs.ray_executor import run_on_ray
 
 _POLL_SECONDS = 1.0
 _QUICK_JOBS = 256  # number of jobs after which a process is replaced, to release its memory
+_COMPILED = "jax_compilation_cache_dir"  # JAX's option; the environment variable has the name in upper case
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOptions) -> None:
@@ -62,6 +67,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
     lines: dict[str, Any] = dict.fromkeys(labels.keys() - missing)
     with (
         progress_bars(unit="updates") as show,
+        _shared_compiled_programs(),
         closing(_run_all(todo, JobBoard(show, updates), options)) as outcomes,
     ):
         for outcome in outcomes:
@@ -91,6 +97,27 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
             f"{len(missing)} of {len(jobs)} jobs are unfinished: {', '.join(sorted(missing))}; {reasons}; repeat the "
             f"command to try these jobs again"
         )
+
+
+@contextmanager
+def _shared_compiled_programs() -> Iterator[None]:
+    """Let local jobs share their compiled programs in a temporary folder, unless JAX has a folder already.
+
+    Jobs that differ only in their seeds run the same programs, and compiling one can take a minute.
+    """
+    if jax.config.values[_COMPILED]:
+        yield
+        return
+    with TemporaryDirectory(prefix="icrl4aht-compiled-", ignore_cleanup_errors=True) as folder:
+        try:
+            jax.config.update(_COMPILED, folder)
+            os.environ[_COMPILED.upper()] = folder  # worker processes read the variable
+            reset_cache()  # JAX decides at its first compilation whether it uses a folder
+            yield
+        finally:
+            jax.config.update(_COMPILED, None)
+            del os.environ[_COMPILED.upper()]
+            reset_cache()
 
 
 def _run_all(jobs: Sequence[Job], board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:

@@ -6,8 +6,8 @@ cooks. Related work on partners with hidden preferences: Yu et al. 2023 (HSP), a
 et al. 2024).
 
 Test tasks have published test teammates; validation and test tasks also have a teammate that never acts. Half of the
-test tasks are on training layouts, the other half on layouts with rooms that no training layout has. On layouts with
-ten dishes, three dishes only occur in test tasks.
+test tasks are on training layouts, the other half on layouts with rooms that no training layout has. On some
+layouts with ten dishes, up to three dishes only occur in test tasks.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
+import jax
 import pytest
 from icrl4aht_baselines.training.stopping import TrainingStopped
 from icrl4aht_generation.collection.job import CollectionJob
@@ -107,6 +108,28 @@ def test_quick_jobs_share_worker_processes(tmp_path):
     pids = [(tmp_path / job.name).read_text() for job in jobs]
     assert len({*pids[:5]}) <= 2
     assert len({pids[0], *pids[5:]}) == 3
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_jobs_share_a_folder_of_compiled_programs_that_is_deleted_at_the_end(tmp_path, monkeypatch, workers):
+    variable = "JAX_COMPILATION_CACHE_DIR"
+    monkeypatch.delenv(variable)
+    folder = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    jobs = [FileJob(tmp_path, name, variable=variable) for name in ("one", "two")]
+    try:
+        run(jobs, tmp_path, workers=workers)
+    finally:
+        jax.config.update("jax_compilation_cache_dir", folder)
+    (shared,) = {(tmp_path / job.name).read_text() for job in jobs}
+    assert "icrl4aht-compiled-" in shared
+    assert not Path(shared).exists()
+    assert variable not in os.environ
+
+
+def test_jobs_use_the_given_folder_of_compiled_programs(tmp_path):
+    run([FileJob(tmp_path, "one", variable="JAX_COMPILATION_CACHE_DIR")], tmp_path)
+    assert (tmp_path / "one").read_text() == jax.config.jax_compilation_cache_dir
 
 
 def test_training_stopped_error_can_be_pickled():
