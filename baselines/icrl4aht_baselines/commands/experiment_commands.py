@@ -69,11 +69,19 @@ def _queue_command(out: str, card: str) -> Callable[[Callable[..., _Queued]], Ca
     return decorate
 
 
-def _ego_options(*own: Callable[[Any], Any], **default_text: str) -> Callable[[Any], Any]:
-    """Return a decorator that adds the options of a command that trains egos; `own` are further options."""
+def _ego_options(
+    *own: Callable[[Any], Any], suite: Sequence[Callable[[Any], Any]] = (), **default_text: str
+) -> Callable[[Any], Any]:
+    """Return a decorator that adds the options of a command that trains egos.
+
+    Args:
+        own: further options of the training.
+        suite: further options that choose tasks.
+        default_text: name of a training option -> its default in the help.
+    """
     training = dataclass_options(ResponseOptions, "training", exclude=("learning_rate",), default_text=default_text)
     seeds = click.option("--seeds", type=COUNT, default=3, help="Training runs of each ego, with different seeds.")
-    tasks, train = topic("Tasks", *shared.tasks_options), topic("Training", *own, seeds, training)
+    tasks, train = topic("Tasks", *shared.tasks_options, *suite), topic("Training", *own, seeds, training)
     return lambda command: tasks(train(command))
 
 
@@ -201,11 +209,14 @@ def best_response_command(
     epilog=examples(
         "icrl4aht-data adaptation-headroom --layout demo_wide --seeds 1 --steps 100000 --out runs/small",
         "icrl4aht-data adaptation-headroom --track preference --workers 2 --bundle",
+        "icrl4aht-data adaptation-headroom --manifest suite/tasks.jsonl --suite suite --family rl",
     ),
 )
-@_ego_options(steps=f"{_STEPS:,}")
+@_ego_options(suite=[shared.suite_option], steps=f"{_STEPS:,}")
 @_queue_command("runs/adaptation", "adaptation.json")
-def adaptation_headroom_command(seeds: int, training: dict[str, Any], out: Path, **choice: Any) -> _Queued:
+def adaptation_headroom_command(
+    suite: Path | None, seeds: int, training: dict[str, Any], out: Path, **choice: Any
+) -> _Queued:
     """Estimate how much memory across episodes can raise returns.
 
     Trains two egos on the tasks of each layout. An informed ego observes the task's number in every step; an episodic
@@ -222,7 +233,7 @@ def adaptation_headroom_command(seeds: int, training: dict[str, Any], out: Path,
     sets: dict[str, list[Task]] = defaultdict(list)
     for task in shared.chosen_tasks(**choice):
         sets[task_set_name(task.track, task.split, task.layout.name, choice["families"])].append(task)
-    jobs = adaptation_jobs(sets, seeds, replace_options(ResponseOptions(_STEPS), training), out)
+    jobs = adaptation_jobs(sets, seeds, replace_options(ResponseOptions(_STEPS), training), out, suite)
 
     def write(folder: Path) -> Path:
         path = write_adaptation(jobs, folder)

@@ -45,6 +45,7 @@ class AdaptationJob(EgoJob):
     Attributes:
         title: name of the set of tasks.
         kind: kind of the ego, "informed" or "episodic", or one of `SCRIPTS`.
+        suite: folder of the learned teammates' checkpoints, see `build_teammate`.
 
     Raises:
         OptionError: if the set has more tasks than are played in parallel.
@@ -52,6 +53,7 @@ class AdaptationJob(EgoJob):
 
     title: str
     kind: str
+    suite: Path | None = None
 
     def __post_init__(self) -> None:
         if self.kind in EGO_KINDS and len(self.tasks) > self.options.tasks:
@@ -108,7 +110,7 @@ class AdaptationJob(EgoJob):
         for number, (task, entry) in enumerate(zip(self.tasks, entries, strict=True)):
             kind, partner = task.teammate_kind, number if self.kind == "informed" else None
             # Heuristics of a kind that plays on several layouts are built without a layout, to share one program.
-            mate = build_teammate(None if kind in several else task.layout, entry)
+            mate = build_teammate(None if kind in several else task.layout, entry, suite=self.suite)
             different.append(PlayTask(task.layout, kind, mate, False, self.title, partner, task.task_id))
         return [different[played % len(different)] for played in range(self.options.tasks)]
 
@@ -132,7 +134,7 @@ def cross_dishes(tasks: Sequence[Task]) -> list[Task]:
 
 
 def adaptation_jobs(
-    sets: Mapping[str, Sequence[Task]], seeds: int, options: ResponseOptions, out: Path
+    sets: Mapping[str, Sequence[Task]], seeds: int, options: ResponseOptions, out: Path, suite: Path | None = None
 ) -> list[AdaptationJob]:
     """Return a job for each seed, set of tasks (name -> tasks) and kind of ego, in this order, and those of scripts.
 
@@ -143,7 +145,7 @@ def adaptation_jobs(
     scripted = tuple(task for tasks in own.values() for task in tasks if task.track == PREFERENCE)
     scripts = [AdaptationJob(scripted, 0, options, out, title=PREFERENCE, kind=kind) for kind in SCRIPTS]
     return [
-        AdaptationJob(tuple(tasks), seed, options, out, title=title, kind=kind)
+        AdaptationJob(tuple(tasks), seed, options, out, title=title, kind=kind, suite=suite)
         for seed in range(seeds)
         for title, tasks in own.items()
         for kind in EGO_KINDS

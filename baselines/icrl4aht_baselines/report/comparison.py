@@ -235,10 +235,11 @@ def render_comparison(stored: StoredResults) -> str:
     """Return the text of docs/results.md. Tables leave out agents of older code, see `AgentFacts.commit`."""
     scales = cell_scales(SUBMITTED_PROTOCOL)
     results = {agent: cells for agent, cells in stored.returns().items() if not stored.agents[agent].commit}
-    scored = cells_with_headroom(scales)
+    scored, hidden_dish = cells_with_headroom(scales), cells_with_headroom(scales, PREFERENCE)
     shown = stored.with_other_play_modes(results)
     effects = secondary_effects(stored, results, scales)
-    flat = [" ".join(cell[:2]) for cell in sorted_cells(scales) if cell.kind == "test" and cell not in scored]
+    played = [cell for cell in sorted_cells(scales) if cell.kind in ("test", PREFERENCE)]
+    flat = [" ".join(cell[:2]) for cell in played if cell not in (*scored, *hidden_dish)]
     one_way = [f"`{agent}`" for agent in results if not any(f"{agent} ({way})" in shown for way in OTHER_WAYS)]
     return fill_template(
         "results.md",

@@ -28,7 +28,10 @@ from icrl4aht_generation.teammates.distances import common_records
 from icrl4aht_data.benchmark.adaptation import EGO_KINDS, SCRIPTS, adaptation_table, read_adaptation, task_set_name
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE, PREFERENCE_LAYOUTS
+from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
+from icrl4aht_data.format.schema import TASKS, TEAMMATES
 from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.utils.text import card_file
 from tests.helpers.paths import ROOT
@@ -236,6 +239,21 @@ def test_sets_without_tasks_of_track_preference_have_no_returns_of_scripts(tmp_p
 def test_headroom_job_with_fewer_tasks_than_needed_raises_error(tmp_path):
     with pytest.raises(OptionError, match=r"tasks = 4: demo_wide has 20 tasks, .* give --tasks 20 or more"):
         AdaptationJob(tuple(DEMO), 0, TINY, tmp_path, title="demo_wide", kind="informed")
+
+
+def test_headroom_is_measured_with_learned_teammates_of_a_suite(tmp_path):
+    tasks = [
+        task
+        for task in read_tasks_and_layouts(MINI / TASKS)
+        if (task.layout.name, task.teammate_family) == ("coord_ring", "rl")
+    ]
+    job, episodic = adaptation_jobs({"learned": tasks}, 1, TINY, tmp_path, suite=MINI / TEAMMATES)
+    played = job._parallel_tasks()
+    assert {task.family for task in played} == {"fcp", "brdiv"}
+    assert [task.partner for task in played] == [*range(len(tasks))] == [0, 1, 2, 3]
+    assert [task.id for task in episodic._parallel_tasks()] == [task.task_id for task in tasks]
+    with pytest.raises(OptionError, match="give the folder of its suite as `suite`"):
+        replace(job, suite=None)._parallel_tasks()
 
 
 @pytest.mark.slow
