@@ -265,8 +265,8 @@ def _read_column(rows: Mapping[str, Any] | Sequence[Mapping[str, Any]], name: st
 def hf_windows(sampler: Sampler, start: int = 0, stop: int | None = None) -> datasets.IterableDataset:
     """Return the rows of batches `start` to `stop` - 1 as a `datasets.IterableDataset`, one column per batch field.
 
-    Integers are int64, and `target_actions` are -100 on padding, as in `torch_loader`. Rows hold NumPy arrays of the
-    batch's dtypes. The result declares no `features`: with features, `datasets` would convert one-dimensional arrays to
+    Integers are int64 except in observations, and `target_actions` are -100 on padding, as in `torch_loader`. Rows hold
+    NumPy arrays. The result declares no `features`: with features, `datasets` would convert one-dimensional arrays to
     lists, and its format "numpy" would convert uint8 to int64.
 
     The `state_dict` of the result resumes after the last row taken. A second pass has the same rows.

@@ -177,7 +177,7 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
             faults.append(str(error))
     try:
         safe_hdf5.check_no_local_heap(shard.path)
-        # Without a chunk cache, because each chunk is read once, and every open dataset would have its own cache.
+        # HDF5's chunk cache is off, because each chunk is read once, and every open dataset would allocate a cache.
         with h5py.File(shard.path, "r", rdcc_nbytes=0) as file:
             open_dataset = cache(partial(safe_hdf5.find_node, file))  # histories of a task share datasets
             found = list(_structure_faults(shard, file, open_dataset))

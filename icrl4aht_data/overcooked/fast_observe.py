@@ -175,9 +175,10 @@ class _Renderer:
         return obs[:, CENTRE, : self._agent].astype(self._dtype)
 
     def _make_patches(self) -> np.ndarray:
-        """Return the changing channels of a cell for each content, of shape (512 + 32 * 256, C - `_first`).
+        """Return the channels from `_first` on of a cell for each content, of shape (512 + 32 * 256, C - `_first`).
 
-        The docstring of `_ON_COUNTER` says which row shows which content.
+        These channels show items, recipes and timers. Rows 0..255 show each item byte on a counter, rows 256..511 a lit
+        button with each recipe byte, and row 512 + 256 * t + b a pot with item byte b and timer t.
         """
         layout, where = self._layout, self._columns
         every_byte = np.arange(256, dtype=np.uint8)

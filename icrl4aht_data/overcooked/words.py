@@ -209,9 +209,9 @@ def _fixed_cells(layout: Layout, canonical: bool) -> np.ndarray:
 
 
 def _contents(layout: Layout, canonical: bool) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Return, for each kind such as `_POT`, the possible contents, int (n,), and each content's channels, uint8 (n, C).
+    """Return the possible contents of cells, int (n,), and their channels, uint8 (n, C), by kind such as `_POT`.
 
-    A content is one number for the two columns that a `_Slot` names: byte + 256 * second.
+    A content is a number that combines two columns of the state record, see `_Slot`: `byte` + 256 * `second`.
     """
     item = np.arange(256)
     possible, count = possible_items(layout), ingredient_count(item)

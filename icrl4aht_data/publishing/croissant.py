@@ -32,7 +32,7 @@ _FORMATS = {
     ".parquet": "application/x-parquet",
     ".safetensors": "application/vnd.safetensors",
 }
-_TYPES = {"bool": "BOOL", "string": "TEXT", "float": "FLOAT", "double": "FLOAT"}  # other Arrow types: INTEGER
+_TYPES = {"bool": "BOOL", "string": "TEXT", "float": "FLOAT", "double": "FLOAT"}  # all other Arrow types are integers
 _TERMS_OF_1_1 = {
     "arrayShape": "cr:arrayShape",
     "containedIn": "cr:containedIn",

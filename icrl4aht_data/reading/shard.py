@@ -246,7 +246,7 @@ class Shard:
         return names + self.table["hash"][first : first + chunks].tobytes()
 
     def describe(self, row: int) -> str:
-        """Return a description of a chunk for messages, with its number, field, history and bytes."""
+        """Return text that identifies a chunk in messages: number, field, history and byte range."""
         offset, size = int(self.table["offset"][row]), int(self.table["size"][row])
         if not self.table["rows"][row]:
             return f"bytes {offset}..{offset + size}, between the chunks"

@@ -209,7 +209,6 @@ def best_response_command(
     epilog=examples(
         "icrl4aht-data adaptation-headroom --layout demo_wide --seeds 1 --steps 100000 --out runs/small",
         "icrl4aht-data adaptation-headroom --track preference --workers 2 --bundle",
-        "icrl4aht-data adaptation-headroom --manifest suite/tasks.jsonl --suite suite --family rl",
     ),
 )
 @_ego_options(suite=[shared.suite_option], steps=f"{_STEPS:,}")

@@ -428,7 +428,7 @@ class PlayTrainer:
         return nullcontext(range(start, stop))
 
     def validation_lines(self, state: PlayState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
-        """Return an empty list, because training by playing has no validation loss; use `evaluate` instead."""
+        """Return an empty list, because online training has no validation loss; `evaluate` measures the model."""
         return []
 
     def step(self, state: PlayState, number: int) -> tuple[PlayState, dict[str, Array]]:
@@ -470,9 +470,9 @@ class PlayTrainer:
         return np.concatenate(found)
 
     def programs(self, params: Any, tasks: Sequence[RolloutState]) -> list[Callable[..., Any]]:
-        """Return the compiled function `episodes` of each player, for its running tasks.
+        """Return `_Player.episodes` of each player, compiled for the shapes of the player's running tasks.
 
-        All players are compiled at the first call, in parallel, since a compilation takes seconds and uses one core.
+        The first call compiles for all players in parallel, since each compilation takes seconds and uses one core.
         """
         if not self._compiled:
             key = jax.random.key(0)

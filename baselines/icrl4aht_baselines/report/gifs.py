@@ -68,7 +68,8 @@ def save_episodes(
     """Play a task, and write some of its episodes as GIFs. The returns equal those that `evaluate` stores.
 
     Args:
-        paths: number of an episode, from 1 -> path of its GIF. Episodes after the last one in `paths` are not played.
+        paths: path of the GIF of each episode to write, by the episode's number, counted from 1. Play ends after the
+            last of these episodes.
         task, make_ego, protocol, seed, suite, forget: see `evaluator.play_tasks`.
         cell: width and height of a map cell in pixels.
     """

@@ -375,7 +375,7 @@ def read_trained(folder: Path) -> TrainedModel:
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
-    label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # `words` computes the same features as `paper`
+    label += "+mlp" if model.encoder == "mlp" else ""  # encoders `words` and `paper` compute the same features
     names, digest = tuple(layout.name for layout in layouts), json_hash(config)
     hidden = tuple(histories.get("hide_recipe", ()))
     return TrainedModel(

@@ -19,8 +19,8 @@ class TrainingJob(ABC):
 
     Attributes:
         seed: seed of the training run.
-        options: settings with the attributes `training`, a function from the seed to the settings of the trainer, and
-            `steps_per_update`; not needed if a class overrides the properties of these names.
+        options: settings of the run. The properties `training` and `steps_per_update` read `options.training(seed)`
+            and `options.steps_per_update`; a subclass with other options overrides both properties.
         out: folder of all jobs.
         xla_threads: see `Job`.
     """

@@ -177,7 +177,7 @@ class StateFile:
                 raise ValueError(f"format {metadata['format']!r}, expected {_FORMAT!r}")
             settings, progress = json.loads(metadata["settings"]), int(metadata["progress"])
         except (SafetensorError, KeyError, ValueError) as error:
-            raise self._unreadable_error(repr(error)) from error
+            raise self._invalid_state_error(repr(error)) from error
         different = {} if self.settings is None else differing_settings(settings, self.settings)
         for name, (found, expected) in different.items():
             resume = f"set {_XLA_THREADS[0]}={found} to resume it, " if name == "xla_threads" and found else ""
@@ -211,26 +211,26 @@ class StateFile:
             OptionError: if the file is missing or damaged, or contains other arrays.
         """
         if self.progress is None:
-            raise self._unreadable_error("no such file")
+            raise self._invalid_state_error("no such file")
         wanted = _named_leaves(like, part)
         try:
             with safe_open(self.path, "numpy") as file:
                 names = [name for name in file.keys() if not part or f"{name}/".startswith(f"{part}/")]  # noqa: SIM118
                 saved = {name: file.get_tensor(name) for name in names}
         except SafetensorError as error:
-            raise self._unreadable_error(str(error)) from error
+            raise self._invalid_state_error(str(error)) from error
         expected = {name: _shape_text(leaf) for name, leaf in wanted.items()}
         found = {name: _shape_text(array) for name, array in saved.items()}
         # Report only the first difference, because a state of another network differs in most arrays.
         for name in sorted(expected.keys() | found.keys()):
             if expected.get(name) != found.get(name):
-                raise self._unreadable_error(
+                raise self._invalid_state_error(
                     f"{name}: expected {expected.get(name, 'nothing')}, found {found.get(name, 'nothing')}"
                 )
         leaves = [_with_sharding(saved[name], leaf) for name, leaf in wanted.items()]
         return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
-    def _unreadable_error(self, problem: str) -> OptionError:
+    def _invalid_state_error(self, problem: str) -> OptionError:
         return OptionError(f"{self.path}: not a state of this training: {problem}; remove the file to start again")
 
 

@@ -73,7 +73,7 @@ def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) 
     return heuristic_entry(family, theta_id, base_seed, dict(theta))
 
 
-@cache  # profiles and lists of drawn teammates ask for the same parameters many times
+@cache  # several callers sample the same parameters, and each sample takes many JAX calls
 def _sampled_theta(heuristic: Heuristic, split: str, seed: str) -> dict[str, float]:
     samplings = {"train": heuristic.train, "test": heuristic.test}
     samplings |= {"diverse": heuristic.diverse} if heuristic.diverse else {}

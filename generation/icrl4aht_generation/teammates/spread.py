@@ -246,7 +246,10 @@ def spread_rows(spreads: Iterable[LayoutSpread]) -> list[dict[str, Any]]:
 
 
 def spread_candidates() -> list[dict[str, Any]]:
-    """Return all candidates, sorted by family: presets, specialists, diverse sampled teammates, mixtures."""
+    """Return all candidates as teammate entries, grouped by family.
+
+    Each family has presets, specialists, teammates with random parameters, and mixtures of these with random actions.
+    """
     return [entry for family in HEURISTIC_FAMILIES for entry in _family_candidates(family)]
 
 

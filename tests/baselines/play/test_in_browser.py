@@ -125,7 +125,7 @@ def test_keys_deliver_a_soup_and_the_page_fits_all_windows():
             for width, dark in itertools.product((DESKTOP, PHONE), (False, True)):
                 page.set_viewport_size({"width": width, "height": 800})
                 page.emulate_media(color_scheme="dark" if dark else "light")
-                page.evaluate("new Promise(requestAnimationFrame)")  # the page draws again in an event
+                page.evaluate("new Promise(requestAnimationFrame)")  # wait for the event handlers that redraw the page
                 check_fits_window(page, width, dark)
                 assert page.locator("#pad").is_visible() == (width == PHONE and not page.evaluate("frame.over"))
 

@@ -314,7 +314,7 @@ CRAMPED_CASES = [
     (H3, {}, {}, "1 21- 11p right, 1 31- 21p down, 1 21- 220 right, 1 32- 31d left, 0 21- 11p left"),
     # H3 as agent 1 stays if its next cell is adjacent to the partner.
     (H3, {}, {}, "1 32- 12- stay, 0 32- 12- left, 1 22- 31- left"),
-    # H3 counts an ingredient in the partner's hand as if it were in the pot, but not a dish.
+    # H3 counts an ingredient that the partner carries as if it were in the pot, but does not count a carried dish.
     (H3, {}, TWO, "0 22- 310 down, 0 22- 311 left, 0 22- 31d left"),
     # H3 fetches a plate for a finished soup, and with high plate urgency also for a soup that is still cooking.
     (H3, {}, DONE, "0 21- 32- left"),

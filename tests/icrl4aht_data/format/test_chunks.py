@@ -1,4 +1,4 @@
-"""Test that every reader refuses damaged or forged chunks by comparing bytes with the chunk table."""
+"""Test that all readers compare chunks with the chunk table, and refuse damaged or forged chunks."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def _choose_action(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[
         Rule(dish & ~cooks_only, scene.goals),
         Rule(plate, scene.cooked),
         Rule(plate, scene.pots_in_use, waits=True),
-        Rule(ingredient, _pots_for(scene, recipe)),
+        Rule(ingredient, _pots_to_fill(scene, recipe)),
         Rule(ingredient, scene.empty_counters),
         Rule(considered & presses, scene.buttons),
         Rule(fetches_plate, scene.plate_piles),
@@ -144,7 +144,7 @@ def _missing_ingredients(scene: Scene, recipe: UInt8[Array, ""]) -> Int[Array, "
     return missing * scene.fillable_pots[:, None] * _recognized_types(scene)
 
 
-def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
+def _pots_to_fill(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
     """Return pots that need the ingredient in the hand; if no pot needs it, all pots that take an ingredient."""
     # Pots with wrong ingredients also take ingredients, and H1 fills them if no pot needs its ingredient.
     held = scene.ingredient_counts(scene.hand)
