@@ -99,7 +99,9 @@ def find_behaviours(tasks: Iterable[Task]) -> list[tuple[Task, ...]]:
 def tasks_with_headroom(tasks: Iterable[Task]) -> list[Task]:
     """Return the tasks in which the scripted oracle earns more than `stay`, according to stored measurements.
 
-    Tasks without a measurement, such as those of the track `preference`, are included.
+    Test tasks are kept if the oracle earns over 1 more, averaged over the layout and family, other tasks if the oracle
+    earns at least `LEAST_HEADROOM` more with the teammate. Tasks without a measurement, such as those of the track
+    `preference`, are kept.
     """
     cells = read_reference_returns(PROTOCOL)
     kept = []

@@ -454,7 +454,7 @@ def describe_training_runs() -> str:
     return (
         f"Each of {len(behaviours)} behaviours of published test teammates has {runs} training "
         f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}; {started} runs started from a "
-        f"bundled model. For {models} behaviours a stored model was chosen instead."
+        f"bundled model, whose steps are not counted. For {models} behaviours a stored model was chosen instead."
     )
 
 
