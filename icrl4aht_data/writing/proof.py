@@ -5,13 +5,16 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.schema import HISTORIES
-from icrl4aht_data.utils.files import file_hash, parse_json, read_text
+from icrl4aht_data.fetch import ReleaseLocation
+from icrl4aht_data.format.index import Index, read_index
+from icrl4aht_data.reading.shard import Shards
+from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.text import card_file, markdown_table
 
 PROOF_FILE = "proof.json"
@@ -27,12 +30,31 @@ _COLUMNS = {
 
 
 def read_proof(root: Path) -> dict[str, Any] | None:
-    """Return the content of `cards/proof.json` if its models were trained on the release in `root`; otherwise None."""
+    """Return the content of `cards/proof.json` with the models that were trained on histories of a release.
+
+    The result is None if there are no such models.
+
+    Args:
+        root: folder of the release.
+    """
     try:
         content = parse_json(read_text(card_file(PROOF_FILE)))
     except OptionError:  # the file has not been made yet
         return None
-    return content if content["histories_sha256"] == file_hash(root / HISTORIES) else None
+    index = read_index(root)
+    hashes = {source: histories_hash(index, source) for source in {one["histories"] for one in content["models"]}}
+    models = [one for one in content["models"] if one["histories_sha256"] == hashes[one["histories"]]]
+    return content | {"models": models} if models else None
+
+
+def histories_hash(index: Index, source: str) -> str:
+    """Return the SHA-256 of the content of a release's histories of one source, or of all sources if it is "all"."""
+    shards, digest = Shards(ReleaseLocation(index.root), index), hashlib.sha256()
+    for entry in index.entries:
+        if source in ("all", entry.source):
+            digest.update(f"{entry.task_id} {entry.T} ".encode())
+            digest.update(shards.open(entry.shard).fingerprint(entry.history_id))
+    return digest.hexdigest()
 
 
 def proof_table(proof: Mapping[str, Any]) -> str:

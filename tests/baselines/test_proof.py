@@ -11,11 +11,10 @@ from icrl4aht_baselines import proof as training
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.proof import ProofJob, ProofOptions, run_references, write_proof
 
-from icrl4aht_data.format.schema import HISTORIES
-from icrl4aht_data.utils.files import file_hash
+from icrl4aht_data.format.index import read_index
 from icrl4aht_data.writing import proof
 from icrl4aht_data.writing.card import card_facts, render_card
-from icrl4aht_data.writing.proof import proof_table, read_proof
+from icrl4aht_data.writing.proof import histories_hash, proof_table, read_proof
 from tests.helpers.random_releases import random_release
 
 
@@ -51,7 +50,7 @@ def test_proof_table_has_mean_and_range_over_finished_training_runs(release, tmp
     }
     path = write_proof(jobs, earned, tmp_path / "proof.json")
     content = json.loads(path.read_text())
-    assert content["histories_sha256"] == file_hash(release / HISTORIES)
+    assert content["models"][0]["histories_sha256"] == histories_hash(read_index(release), "all")
     assert content["models"][0]["share"] == [0.25, 0.5]  # the models earn 5 and 10, and rl2-reference earns 20
     spreads = ["-2.0 (-2.0 to -2.0)", "15.0 (10.0 to 20.0)", "-2.0 (-2.0 to -2.0)", "-1.0 (-1.0 to -1.0)"]
     spreads += ["0.38 (0.25 to 0.50)", "20.0 (20.0 to 20.0)"]
@@ -59,19 +58,24 @@ def test_proof_table_has_mean_and_range_over_finished_training_runs(release, tmp
 
 
 def test_dataset_card_shows_only_results_of_models_trained_on_its_release(release, tmp_path, monkeypatch):
+    model = {key: [1.0] for key in ("first", "late", "first_cleared", "late_cleared", "share", "minutes")}
+    model |= {"histories": "ppo", "learner": "AD", "seeds": [0]}
+    model |= {"histories_sha256": histories_hash(read_index(release), "ppo")}
     content = {
-        "histories_sha256": file_hash(release / HISTORIES),
         "training": {"steps": 800, "batch_size": 16, "context": 500},
         "tasks": {"preference": 48, "teammate": 20},
         "references": {"stay": {"6-20": 1.0}, "search": {"1": 2.0, "6-20": 40.0}},
-        "models": [],
+        "models": [model],
     }
     stored = tmp_path / "proof.json"
     monkeypatch.setattr(proof, "card_file", lambda name: stored)
     stored.write_text(json.dumps(content))
     assert read_proof(release) == content
     assert "## What it teaches" in render_card(card_facts(release))
-    stored.write_text(json.dumps(content | {"histories_sha256": "0"}))
+    other = model | {"histories_sha256": "0"}
+    stored.write_text(json.dumps(content | {"models": [other, model]}))
+    assert read_proof(release) == content
+    stored.write_text(json.dumps(content | {"models": [other]}))
     assert read_proof(release) is None
     assert "## What it teaches" not in render_card(card_facts(release))
 

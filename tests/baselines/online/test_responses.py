@@ -199,7 +199,9 @@ def test_headroom_tables_in_cards_and_docs_match_stored_results():
     assert {entry["tasks"] for entry in own} == {
         task_set_name(PREFERENCE, "test", layout) for of in PREFERENCE_LAYOUTS.values() for layout in of
     }
-    returns = [{**entry["scripts"], **{kind: entry["returns"][kind]["0"] for kind in EGO_KINDS}} for entry in own]
+    assert {tuple(entry["returns"][kind]) for entry in own for kind in EGO_KINDS} == {("0", "1")}
+    trained = [{kind: np.mean([*entry["returns"][kind].values()]) for kind in EGO_KINDS} for entry in own]
+    returns = [entry["scripts"] | of for entry, of in zip(own, trained, strict=True)]
     means = [np.mean([of[name] for of in returns]) for name in (*SCRIPTS, "episodic", "informed")]
     differences = [of["informed"] - of["episodic"] for of in returns]
     numbers = [f"{mean:.1f}" for mean in means] + [f"+{min(differences):.1f} to +{max(differences):.1f}"]
