@@ -205,7 +205,8 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
     Args:
         jobs: training jobs; unfinished jobs are skipped.
         references: name of an ego -> returns from `evaluate_on_sets`.
-        path: path of the file, which is replaced.
+        path: path of the file. Models in an earlier file that were trained and evaluated with the same settings, but on
+            other histories or with other labels, are kept.
     """
     stay, expert = (references[name][TEAMMATE_TRACK]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
     finished, models = [job for job in jobs if job.is_finished()], []
@@ -225,13 +226,17 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
                 entry[when + memory] = [one["returns"][PREFERENCE + control][block] for one in results]
         earned = [one["returns"][TEAMMATE_TRACK]["all"] for one in results]
         models.append(entry | {"share": [round((one - stay) / (expert - stay), 3) for one in earned]})
-    content = {
+    content: dict[str, Any] = {
         "data_version": dataset.info.data_version,
         "training": {"steps": options.steps, "batch_size": options.batch_size, "context": options.context},
         "tasks": {name: len(tasks) for name, tasks in options.tasks.items()},
         "references": {name: references[name][PREFERENCE] for name in COMPARED_EGOS[PREFERENCE]},
         "models": models,
     }
+    before = parse_json(read_text(path)) if path.is_file() else {}
+    if all(before.get(name) == content[name] for name in ("training", "tasks")):
+        new = {(one["histories"], one["learner"]) for one in models}
+        models += [one for one in before["models"] if (one["histories"], one["learner"]) not in new]
     with atomic_write(path) as partial:
         write_json(partial, content)
     return path

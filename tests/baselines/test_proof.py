@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +37,17 @@ def block_returns(first: float, late: float, cleared: float, teammate: float) ->
     return blocks | {"teammate": {"all": teammate}}
 
 
+def content_of(job: ProofJob, late: float) -> dict[str, Any]:
+    """Return the result of a finished job, for its file."""
+    return {"settings": job.settings, "minutes": 20.0, "returns": block_returns(-2.0, late, -1.0, late / 2)}
+
+
 def test_proof_table_has_mean_and_range_over_finished_training_runs(release, tmp_path):
     options = small_options(release)
     jobs = [ProofJob("all", "ad-expert", seed, options, tmp_path) for seed in (0, 1, 2)]
     for job, late in zip(jobs[:2], (10.0, 20.0), strict=True):  # the third job stays unfinished
         job.folder.mkdir()
-        content = {"settings": job.settings, "minutes": 20.0, "returns": block_returns(-2.0, late, -1.0, late / 2)}
-        job.result_file.write_text(json.dumps(content))
+        job.result_file.write_text(json.dumps(content_of(job, late)))
     assert [job.is_finished() for job in jobs] == [True, True, False]
     earned = {
         name: block_returns(0.0, 40.0, 0.0, value)
@@ -52,6 +57,18 @@ def test_proof_table_has_mean_and_range_over_finished_training_runs(release, tmp
     content = json.loads(path.read_text())
     assert content["models"][0]["histories_sha256"] == histories_hash(read_index(release), "all")
     assert content["models"][0]["share"] == [0.25, 0.5]  # the models earn 5 and 10, and rl2-reference earns 20
+    other = ProofJob("all", "ad", 0, options, tmp_path)
+    other.folder.mkdir()
+    other.result_file.write_text(json.dumps(content_of(other, 0.0)))
+    write_proof([other], earned, path)
+    assert [one["learner"] for one in json.loads(path.read_text())["models"]] == [
+        "AD, own actions",
+        "AD, expert labels",
+    ]
+    changed = replace(other, options=replace(options, steps=3))
+    changed.result_file.write_text(json.dumps(content_of(changed, 0.0)))
+    write_proof([changed], earned, path)
+    assert len(json.loads(path.read_text())["models"]) == 1, "the settings of the earlier models differ"
     spreads = ["-2.0 (-2.0 to -2.0)", "15.0 (10.0 to 20.0)", "-2.0 (-2.0 to -2.0)", "-1.0 (-1.0 to -1.0)"]
     spreads += ["0.38 (0.25 to 0.50)", "20.0 (20.0 to 20.0)"]
     assert " | ".join(["| all | AD, expert labels | 2", *spreads]) in proof_table(content)
