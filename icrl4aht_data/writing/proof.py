@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.fetch import ReleaseLocation
+from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import Index, read_index
-from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import card_file, markdown_table
 
 PROOF_FILE = "proof.json"
@@ -49,11 +49,16 @@ def read_proof(root: Path) -> dict[str, Any] | None:
 
 def histories_hash(index: Index, source: str) -> str:
     """Return the SHA-256 of the content of a release's histories of one source, or of all sources if it is "all"."""
-    shards, digest = Shards(ReleaseLocation(index.root), index), hashlib.sha256()
-    for entry in index.entries:
-        if source in ("all", entry.source):
-            digest.update(f"{entry.task_id} {entry.T} ".encode())
-            digest.update(shards.open(entry.shard).fingerprint(entry.history_id))
+    digest = hashlib.sha256()
+    for shard, entries in grouped(index.entries, lambda entry: entry.shard).items():
+        if source != "all" and all(entry.source != source for entry in entries):
+            continue
+        hashes, first = read_table(index.root / chunk_table_name(shard))["hash"], 0
+        for entry in entries:  # the table lists the chunks by history
+            end = first + sum(map(entry.chunks, entry.stored_fields(index.info.kind)))
+            if source in ("all", entry.source):
+                digest.update(f"{entry.task_id} {entry.T} ".encode() + hashes[first:end].tobytes())
+            first = end
     return digest.hexdigest()
 
 
