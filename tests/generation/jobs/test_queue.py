@@ -114,7 +114,7 @@ def test_quick_jobs_share_worker_processes(tmp_path):
 def test_jobs_share_a_folder_of_compiled_programs_that_is_deleted_at_the_end(tmp_path, monkeypatch, workers):
     variable = "JAX_COMPILATION_CACHE_DIR"
     monkeypatch.delenv(variable)
-    folder = jax.config.jax_compilation_cache_dir
+    folder = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", None)
     jobs = [FileJob(tmp_path, name, variable=variable) for name in ("one", "two")]
     try:
@@ -129,7 +129,7 @@ def test_jobs_share_a_folder_of_compiled_programs_that_is_deleted_at_the_end(tmp
 
 def test_jobs_use_the_given_folder_of_compiled_programs(tmp_path):
     run([FileJob(tmp_path, "one", variable="JAX_COMPILATION_CACHE_DIR")], tmp_path)
-    assert (tmp_path / "one").read_text() == jax.config.jax_compilation_cache_dir
+    assert (tmp_path / "one").read_text() == jax.config.values["jax_compilation_cache_dir"]
 
 
 def test_training_stopped_error_can_be_pickled():
