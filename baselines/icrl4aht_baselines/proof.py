@@ -30,7 +30,6 @@ from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, Tra
 from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import load_icrl4aht
-from icrl4aht_data.format.index import read_index
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.writing.proof import histories_hash
@@ -211,13 +210,12 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
     stay, expert = (references[name][TEAMMATE_TRACK]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
     finished, models = [job for job in jobs if job.is_finished()], []
     options, dataset = jobs[0].options, load_icrl4aht(jobs[0].options.root)
-    index = read_index(dataset.root)
     for (source, learner), own in grouped(finished, lambda job: (job.source, job.learner)).items():
         results = [job.result() for job in own]
         entry = {
             "histories": source,
             "learner": LEARNERS[learner].title,
-            "histories_sha256": histories_hash(index, source),
+            "histories_sha256": histories_hash(dataset.index, source),
             "seeds": [job.seed for job in own],
             "minutes": [one["minutes"] for one in results],
         }

@@ -70,18 +70,18 @@ def _queue_command(out: str, card: str) -> Callable[[Callable[..., _Queued]], Ca
 
 
 def _ego_options(
-    *own: Callable[[Any], Any], suite: Sequence[Callable[[Any], Any]] = (), **default_text: str
+    *own: Callable[[Any], Any], task_options: Sequence[Callable[[Any], Any]] = (), **default_text: str
 ) -> Callable[[Any], Any]:
     """Return a decorator that adds the options of a command that trains egos.
 
     Args:
         own: further options of the training.
-        suite: further options that choose tasks.
+        task_options: further options that choose tasks.
         default_text: name of a training option -> its default in the help.
     """
     training = dataclass_options(ResponseOptions, "training", exclude=("learning_rate",), default_text=default_text)
     seeds = click.option("--seeds", type=COUNT, default=3, help="Training runs of each ego, with different seeds.")
-    tasks, train = topic("Tasks", *shared.tasks_options, *suite), topic("Training", *own, seeds, training)
+    tasks, train = topic("Tasks", *shared.tasks_options, *task_options), topic("Training", *own, seeds, training)
     return lambda command: tasks(train(command))
 
 
@@ -211,7 +211,7 @@ def best_response_command(
         "icrl4aht-data adaptation-headroom --track preference --workers 2 --bundle",
     ),
 )
-@_ego_options(suite=[shared.suite_option], steps=f"{_STEPS:,}")
+@_ego_options(task_options=[shared.suite_option], steps=f"{_STEPS:,}")
 @_queue_command("runs/adaptation", "adaptation.json")
 def adaptation_headroom_command(
     suite: Path | None, seeds: int, training: dict[str, Any], out: Path, **choice: Any

@@ -453,8 +453,8 @@ def describe_training_runs() -> str:
     runs = _format_range([len(one.seeds) for one in behaviours], "d")
     return (
         f"Each of {len(behaviours)} behaviours of published test teammates has {runs} training "
-        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}; {started} runs started from a "
-        f"bundled model, whose steps are not counted. For {models} behaviours a stored model was chosen instead."
+        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}; {started} runs fine-tuned a "
+        f"bundled model (its own training is not counted). For {models} behaviours a stored model earned more."
     )
 
 

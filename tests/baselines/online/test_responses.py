@@ -200,6 +200,7 @@ def test_headroom_tables_in_cards_and_docs_match_stored_results():
         task_set_name(PREFERENCE, "test", layout) for of in PREFERENCE_LAYOUTS.values() for layout in of
     }
     assert {tuple(entry["returns"][kind]) for entry in own for kind in EGO_KINDS} == {("0", "1")}
+    assert min(entry["interval"][0] for entry in own) > 10
     trained = [{kind: np.mean([*entry["returns"][kind].values()]) for kind in EGO_KINDS} for entry in own]
     returns = [entry["scripts"] | of for entry, of in zip(own, trained, strict=True)]
     means = [np.mean([of[name] for of in returns]) for name in (*SCRIPTS, "episodic", "informed")]
