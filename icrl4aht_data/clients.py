@@ -38,7 +38,7 @@ def offline_switches() -> list[str]:
 
 
 def without_credentials(text: str) -> str:
-    """Remove user names, passwords, queries and fragments from all addresses in a text."""
+    """Return a text without the user names, passwords, queries and fragments of its URLs."""
     return _ADDRESS.sub(r"\g<scheme>\g<rest>", text)
 
 

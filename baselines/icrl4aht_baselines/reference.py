@@ -260,7 +260,9 @@ class ReferenceJob(TrainingJob):
                 command = ["-m", "icrl4aht_data", "generate", "--profile", profile, "--out", str(folder)]
                 failed = subprocess.run([sys.executable, *command], check=False).returncode
                 if failed:
-                    raise OptionError(f"{folder}: `python {' '.join(command)}` failed; run it to see the reason")
+                    raise OptionError(
+                        f"{folder}: `python {' '.join(command)}` failed with exit code {failed}, see its output"
+                    )
         return folder / "lite"
 
     def teammates(self, number: int = 0) -> Any:

@@ -1,7 +1,7 @@
 """Entry point of `icrl4aht-data`: imports a command only when it runs, and converts errors to exit codes.
 
-Exit codes: 0 success; 1 an error, a problem found, or a closed output pipe; 2 a misused command; 128 plus the signal's
-number after a signal stopped a training run, whose state was saved.
+Exit codes: 0 success; 1 an error, a problem found, or a closed output pipe; 2 wrong usage; 128 plus the signal's number
+after a signal stopped a run, whose progress was saved.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Examples:
 ROOT is a release: its folder, or its address hf://datasets/<org>/<repo>[@<revision>], https://... or s3://... The
 default is the mini release that is part of the package.
 
-Exit codes: 0 success, 1 a failure or a problem found, 2 a misused command, 130 or 143 training stopped by SIGINT or
+Exit codes: 0 success, 1 a failure or a problem found, 2 wrong usage, 130 or 143 training stopped by SIGINT or
 SIGTERM, and saved. Commands that train or generate resume an interrupted run. `icrl4aht-data doctor` prints the folders
 and environment variables in use.
 

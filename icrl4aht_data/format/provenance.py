@@ -143,7 +143,7 @@ class ReferenceEgos(Struct, frozen=True, omit_defaults=True):
         return {name: value for name, value in found.items() if value is not None}
 
     @property
-    def egos_differ(self) -> bool:
+    def returns_differ(self) -> bool:
         """Whether the returns of the best and the worst measured ego differ by at least `LEAST_HEADROOM`."""
         return max(self.returns.values()) - min(self.returns.values()) >= LEAST_HEADROOM
 

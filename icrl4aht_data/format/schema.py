@@ -166,7 +166,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     Args:
         history_id: position of the line in the index, counted from 0.
         task_id: id of the history's task, see `benchmark.tasks`.
-        env_idx: number of the environment stream within the learner's parallel rollout, or of a noise history.
+        env_idx: index of the stream in the learner's parallel rollout; without a learner, number of the history.
         T: number of steps.
         obs_shape: shape (5, 5, C) of one observation.
         action_dim: number of actions.

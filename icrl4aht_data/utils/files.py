@@ -44,7 +44,7 @@ _STARTS = {
     ".svg": b"<?xml",
 }  # first bytes of the files that commands write, by suffix
 
-_DEPTH = 64  # maximum nesting of JSON, well below the depth of Python's stack
+_DEPTH = 64  # maximum nesting depth of JSON, well below Python's recursion limit
 
 
 def check_file_size(path: Path, most: int) -> None:
@@ -119,7 +119,7 @@ def parse_json(text: str) -> Any:
         if not level:
             return value
         level = [inner for part in level for inner in (part.values() if isinstance(part, dict) else part)]
-    raise IndexFormatError(f"expected JSON of at most {_DEPTH} levels, found more levels")
+    raise IndexFormatError(f"expected JSON of at most {_DEPTH} levels, found more")
 
 
 def write_json(path: Path, content: Any, indent: int | None = 2) -> None:

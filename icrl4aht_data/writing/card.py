@@ -310,7 +310,7 @@ def _teammate_rows(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[
                 "seed": task and task.teammate.get("base_seed"),
                 "sources": sorted({one.first.source for one in own}),
                 "references": references and references.returns,
-                "matters": references and references.egos_differ,
+                "matters": references and references.returns_differ,
                 "nearest_test": nearest and msgspec.structs.asdict(nearest),
             }
         )
@@ -348,7 +348,7 @@ def _layout_rows(
     Args:
         info: info of the release, with a summary of each layout.
         titles: titles of the layouts by name, see `layout_title`.
-        matters: values of `ReferenceEgos.egos_differ` of the compared teammates, by layout title.
+        matters: values of `ReferenceEgos.returns_differ` of the compared teammates, by layout title.
     """
     rows = []
     for title in dict.fromkeys(titles.values()):

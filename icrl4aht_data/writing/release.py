@@ -57,7 +57,7 @@ class NewHistory:
     """One history to write to a release.
 
     Args:
-        env_idx: number of the environment in the learner's parallel rollout; without a learner, number of the history.
+        env_idx: index of the stream in the learner's parallel rollout; without a learner, number of the history.
         arrays: arrays by field name, for the fields `schema.memory_fields` of the release's kind; for a full release,
             `obs` is rendered from the states.
         learner: number of the independent learner that made the history, counted from 0.

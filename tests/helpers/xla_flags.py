@@ -25,7 +25,7 @@ def is_xla_flag(flag: str) -> bool:
 
 
 def optimized(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that does the same and is compiled with optimizations.
+    """Return the function, compiled with optimizations.
 
     This saves time if it runs longer than it compiles. The tests compile other functions with few optimizations.
     """

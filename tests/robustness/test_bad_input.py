@@ -22,7 +22,7 @@ from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import HISTORIES
 from tests.helpers.random_releases import SHARD
-from tests.helpers.spoiled import spoil
+from tests.helpers.tampered import tamper
 
 
 def load_damaged(root, **options):
@@ -117,7 +117,7 @@ def test_truncated_shard_raises_error(release_copy, share):
 def test_index_that_disagrees_with_a_shard_raises_error(release_copy):
     right = (release_copy / HISTORIES).read_text()
     for change in ({"T": 100, "episodes": 5}, {"has_expert_actions": False}):
-        spoil(release_copy, HISTORIES, lambda lines, change=change: lines[0].update(change))
+        tamper(release_copy, HISTORIES, lambda lines, change=change: lines[0].update(change))
         with pytest.raises(ShardMismatchError, match=r"the index (says|implies)"):
             read_all(release_copy)
         (release_copy / HISTORIES).write_text(right)

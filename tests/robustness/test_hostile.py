@@ -118,7 +118,7 @@ def test_names_are_printed_without_interpreting_markup(release_copy):
 
 def test_parse_json_limits_the_depth_of_nesting():
     assert parse_json('{"a": [[1]]}') == {"a": [[1]]}
-    with pytest.raises(IndexFormatError, match="found more levels"):
+    with pytest.raises(IndexFormatError, match="levels, found more"):
         parse_json("[" * 65 + "]" * 65)
 
 

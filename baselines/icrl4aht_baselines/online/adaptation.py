@@ -89,9 +89,9 @@ class AdaptationJob(EgoJob):
         return 1 if self.kind in SCRIPTS else super().updates
 
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
-        """Train the ego if it is no script. Return {"returns": task id -> mean return in new episodes}.
+        """Train the ego, unless it is a script, and evaluate it.
 
-        A trained ego samples its actions.
+        Return {"returns": task id -> mean return in new episodes}. A trained ego samples its actions.
         """
         if self.kind in SCRIPTS:
             ego = find_agent(self.kind).make

@@ -270,7 +270,7 @@ def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
     if dataset is not None:
         for layout, task_id in zip(dataset.column("layout"), dataset.column("task_id"), strict=True):
             made = dataset.provenance.get(str(task_id))
-            matters[str(layout)] |= made is None or made.references is None or made.references.egos_differ
+            matters[str(layout)] |= made is None or made.references is None or made.references.returns_differ
     return {layout: 1.0 if found else FLAT_SHARE for layout, found in matters.items()}
 
 

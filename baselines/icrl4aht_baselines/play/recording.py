@@ -1,4 +1,4 @@
-"""Recording of games that people play, with their consent, as a release of source `human`."""
+"""Record the games of consenting players as a release with source `human`."""
 
 from __future__ import annotations
 

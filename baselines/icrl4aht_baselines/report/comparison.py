@@ -44,7 +44,7 @@ from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts,
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.adaptation import published_adaptation_table
 from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE, TRACKS
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE
 from icrl4aht_data.benchmark.reference_returns import read_reference_returns
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import add_legend_below, average_in_blocks, axis_limits, save_figure
@@ -314,9 +314,9 @@ def agents_table(
             score = find_score(cells, cells_with_headroom(scales, track), scales)
             tested = effects.get(("N", track, agent))
             total = tested.text(2, "") if tested else _format_interval(score and score.total)
-            row += [total] if track == PREFERENCE else [total, _format_interval(score and score.middle)]
+            row += [total, _format_interval(score and score.middle)]
         body.append(row)
-    scored = [f"{name}, {track}" for track in TRACKS for name in ("N", "IQM")] + [f"N, {PREFERENCE}"]
+    scored = [f"{name}, {track}" for track in ALL_TRACKS for name in ("N", "IQM")]
     return markdown_table(["model", "data", "labels", "budget", *scored], body)
 
 

@@ -17,7 +17,7 @@ from icrl4aht_generation.layouts.fixtures import LayoutDraw
 from icrl4aht_generation.layouts.grids import canonical_map
 from icrl4aht_generation.layouts.rearranged import MOST_REPEATS, draw_rearranged
 from icrl4aht_generation.layouts.rooms import draw_rooms
-from icrl4aht_generation.layouts.templates import draw_templates, has_tested_rooms
+from icrl4aht_generation.layouts.templates import draw_templates, has_test_rooms
 
 LAYOUT_FAMILIES: dict[str, Callable[[int], Iterator[LayoutDraw]]] = {
     "rearranged": draw_rearranged,
@@ -107,7 +107,7 @@ def split_of(layout: Layout) -> str:
 
     Layouts with the rooms of a published test layout, see `published_rooms`, are never in the split `train`.
     """
-    splits = [split for split in LAYOUT_SPLITS if split != "train" or not has_tested_rooms(layout)]
+    splits = [split for split in LAYOUT_SPLITS if split != "train" or not has_test_rooms(layout)]
     digest = hashlib.sha256("\n".join(canonical_map(layout)).encode()).digest()
     ends = np.cumsum([LAYOUT_SPLITS[split] for split in splits])
     position = int.from_bytes(digest[:6], "big") / 2**48  # below 1, because a float stores six bytes exactly

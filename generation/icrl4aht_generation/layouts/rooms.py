@@ -23,7 +23,7 @@ _FEWEST_CELLS = 6  # minimum number of cells in the first rectangle of a shared 
 def draw_rooms(seed: int) -> Iterator[LayoutDraw]:
     """Yield layouts with a shared room, two rooms and a ring in turn; no published layout has these rooms."""
     rng = np.random.default_rng([seed, *b"rooms"])
-    published = published_rooms(tested=False) | published_rooms(tested=True)
+    published = published_rooms(test=False) | published_rooms(test=True)
     while True:
         for draw in (_shared_room, _two_rooms, _ring_room):
             drawn = None

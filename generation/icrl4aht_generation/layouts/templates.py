@@ -14,7 +14,7 @@ from icrl4aht_generation.layouts.grids import agent_rooms, canonical_floor, symm
 
 
 @cache
-def published_rooms(tested: bool) -> dict[tuple[str, ...], list[np.ndarray]]:
+def published_rooms(test: bool) -> dict[tuple[str, ...], list[np.ndarray]]:
     """Return the rooms of published layouts that are reserved for tests, or those that are not, without repeats.
 
     Args:
@@ -38,15 +38,15 @@ def _layout_floor(layout: Layout) -> tuple[str, ...]:
     return canonical_floor(layout.walkable.reshape(layout.height, layout.width))
 
 
-def has_tested_rooms(layout: Layout) -> bool:
+def has_test_rooms(layout: Layout) -> bool:
     """Return whether a layout has rooms that are reserved for tests, see `published_rooms`."""
-    return _layout_floor(layout) in published_rooms(tested=True)
+    return _layout_floor(layout) in published_rooms(test=True)
 
 
 def draw_templates(seed: int) -> Iterator[LayoutDraw]:
     """Yield layouts with published rooms; every second layout has rooms allowed in training, see `published_rooms`."""
     rng = np.random.default_rng([seed, *b"templates"])
-    groups = [list(published_rooms(tested).values()) for tested in (False, True)]
+    groups = [list(published_rooms(test).values()) for test in (False, True)]
     while True:
         for group in groups:
             drawn = None

@@ -176,6 +176,6 @@ class ActorCritic(nn.Module):
 
 
 def _orthogonal_gates(key: Array, shape: tuple[int, int], dtype=jnp.float32) -> Array:
-    # Each gate's matrix is orthogonal, as in Flax, so fusing the gates does not change training.
+    # Each gate's matrix starts orthogonal, as in Flax, so fusing the gates does not change initialization.
     one = nn.initializers.orthogonal()
     return jnp.concatenate([one(k, (shape[0], shape[0]), dtype) for k in jax.random.split(key, 3)], axis=1)

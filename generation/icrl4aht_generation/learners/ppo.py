@@ -116,14 +116,12 @@ class RecurrentNetwork(Protocol):
     """Interface of the actor-critics that PPO trains, such as `ActorCritic`."""
 
     def apply(self, variables: Any, /, *inputs: Any) -> Any:
-        """Return the recurrent state after T steps of M sequences, logits, and values.
-
-        The logits have shape (T, M, A), the values (T, M).
+        """Return the recurrent state after T steps of M sequences, logits (T, M, A), and values (T, M).
 
         Args:
             variables: parameters of the network.
-            inputs: recurrent state of shape (M, H) before the first step, then `seen`, `reset` and `partner` as in
-                `Sequences`.
+            inputs: recurrent state of shape (M, H) before the first step, then `seen` and `reset` as in `Sequences`,
+                and `partner` of shape (M,).
         """
         ...
 

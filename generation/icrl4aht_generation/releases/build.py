@@ -116,7 +116,7 @@ def train_teammates(
     units, left_out = [], []
     for work in profile.units(learned):
         earned = of_teammate.get(work.task.teammate_key)
-        if earned is None or earned.egos_differ:
+        if earned is None or earned.returns_differ:
             units.append(work)
         elif work.learner == 0:
             reason = f"no headroom: {earned.describe()}"

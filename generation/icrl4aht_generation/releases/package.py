@@ -112,7 +112,7 @@ def select_histories(
     else:
         streams = [np.arange(len(own)) for own in returns]
     found = TaskHistories(task, source, folders, returns, streams, least)
-    if least is not None and not facts.references.egos_differ:
+    if least is not None and not facts.references.returns_differ:
         return found.left_out(
             f"no headroom: returns of these egos differ by less than {LEAST_HEADROOM:g}: {facts.references.describe()}"
         )
@@ -160,7 +160,7 @@ def package_release(
     """
     check_release_folder(target, profile)
     tasks = grouped(units, lambda work: work.task.task_id)
-    headroom = {work.task.layout.name for work in units if facts[work.task.task_id].references.egos_differ}
+    headroom = {work.task.layout.name for work in units if facts[work.task.task_id].references.returns_differ}
     recorded, new, omitted, curves = recorded_provenance(suite), [], list(left_out), SourceCurves()
     for task_id, members in tasks.items():
         task = members[0].task

@@ -46,8 +46,8 @@ from icrl4aht_data.overcooked.layouts import get_layout, with_recipes
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import initial_record
 from tests.helpers.commands import run_cli
-from tests.helpers.spoiled import read_lines
 from tests.helpers.states import random_records
+from tests.helpers.tampered import read_lines
 
 LAYOUT = get_layout("cramped_up")
 MODEL = ModelOptions(width=16, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05)

@@ -124,7 +124,7 @@ def test_results_on_track_preference_have_their_own_columns_and_rows(stored, tmp
     assert len([cell for cell in scales if cell.kind == PREFERENCE]) == len({(cell.layout, cell.family)
                for cell in more.returns()["high"] if cell.kind == PREFERENCE})  # fmt: skip
     table = comparison.agents_table(more, more.returns(), scales, found)
-    assert "| N, layout | IQM, layout | N, preference |" in table
+    assert "| N, layout | IQM, layout | N, preference | IQM, preference |" in table
     high, low = agent_row(table, "high"), agent_row(table, "low")
     assert high[8].startswith("**0.51 (") and low[8:] == ["–"]
     assert high[:8] == agent_row(comparison.agents_table(stored, stored.returns(), scales, effects(stored)), "high")[:8]

@@ -34,7 +34,7 @@ from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, Option
 from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
-from tests.helpers.spoiled import read_lines
+from tests.helpers.tampered import read_lines
 from tests.helpers.tiny import start_python
 from tests.helpers.two_sources import two_source_release
 from tests.helpers.xla_flags import add_xla_flag

@@ -21,7 +21,7 @@ from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS
 from icrl4aht_generation.layouts.fixtures import FREE_COUNTERS, faced_cells
 from icrl4aht_generation.layouts.grids import agent_rooms, grid_of, symmetric_images
 from icrl4aht_generation.layouts.rooms import MOST_COLUMNS, MOST_ROWS
-from icrl4aht_generation.layouts.templates import has_tested_rooms, published_rooms
+from icrl4aht_generation.layouts.templates import has_test_rooms, published_rooms
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TRACKS
 from icrl4aht_data.errors import OptionError, UnknownNameError
@@ -118,7 +118,7 @@ def test_canonical_map_depends_on_start_rooms_but_not_start_cells():
 def test_generated_layouts_are_split_by_declared_shares(samples):
     for family, layouts in samples.items():
         splits = [split_of(one) for one in layouts]
-        may_train = np.array([not has_tested_rooms(one) for one in layouts])
+        may_train = np.array([not has_test_rooms(one) for one in layouts])
         assert not {"train"} & {split for split, may in zip(splits, may_train, strict=True) if not may}
         for split, share in LAYOUT_SPLITS.items():
             trained = np.array(splits)[may_train] == split
@@ -129,11 +129,11 @@ def test_generated_layouts_are_split_by_declared_shares(samples):
 
 def test_layouts_with_rooms_of_test_layouts_are_not_for_training(samples):
     """Rooms of test layouts are excluded from training, except rooms that training layouts of track `layout` have."""
-    assert {name for name in LAYOUT_NAMES if not has_tested_rooms(get_layout(name))} == {
+    assert {name for name in LAYOUT_NAMES if not has_test_rooms(get_layout(name))} == {
         *TRACKS["layout"]["train"],
         *TRACKS["layout"]["test"],
     }
-    tested = [one for one in samples["templates"] if has_tested_rooms(one)]
+    tested = [one for one in samples["templates"] if has_test_rooms(one)]
     assert len(tested) == 400 and {split_of(one) for one in tested} == {"validation", "test"}
 
 

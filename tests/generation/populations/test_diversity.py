@@ -28,7 +28,7 @@ def start_steps(params, key) -> jax.Array:
 
 
 def act_by_view(params, steps, view, key):
-    """Return an action that depends on the number of steps and the observation."""
+    """Return an action that depends on the parameter, the number of steps and the observation."""
     return (params["turn"] + steps + view.sum(dtype=jnp.int32)) % 6, steps + 1
 
 

@@ -261,7 +261,7 @@ def write_suite_with_returns(root: Path, returns: dict[tuple[int, int], float], 
 
 @pytest.fixture(scope="module")
 def candidates(tmp_path_factory) -> Path:
-    """Return a suite with 50 checkpoints of each algorithm: 40 have returns above the threshold of 20, 5 exactly 20."""
+    """Return a suite with 50 checkpoints of each algorithm: 40 with returns above 20, 5 at 20, 5 below."""
     root = tmp_path_factory.mktemp("candidates")
     for algorithm in ALGORITHMS:
         returns = {(m, c): 21.0 + m + c for m in range(10) for c in range(5)}

@@ -268,6 +268,6 @@ def test_families_without_usable_draws_are_reported_with_the_reason(monkeypatch)
 def test_reference_returns_with_a_preset_teammate_are_measured(tmp_path):
     task = make_task("teammate", "train", "demo_wide", heuristic_teammate("utility_greedy", "default", 0), 0)
     facts = teammate_facts([task], tmp_path, tmp_path)[task.task_id]
-    assert facts.references.egos_differ
+    assert facts.references.returns_differ
     assert facts.references.stay == 0 < facts.references.oracle
     assert facts.nearest is None

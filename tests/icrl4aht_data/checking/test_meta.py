@@ -15,7 +15,7 @@ from icrl4aht_data.format.provenance import read_provenance
 from icrl4aht_data.format.schema import HISTORIES, INFO, PROVENANCE
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.random_releases import SHARD
-from tests.helpers.spoiled import first_value, problems, spoiled_copy
+from tests.helpers.tampered import first_value, problems, tampered_copy
 from tests.robustness.limits import time_limit
 
 
@@ -75,13 +75,13 @@ def test_verify_finds_false_values_in_meta_files(release, tmp_path, name, change
     assert note.ego is not None
     environments = note.ego["environments"]
     message = message.format(recorded=note.streams_recorded, environments=environments, total=2 * environments)
-    found = problems(spoiled_copy(release, tmp_path / "release", name, change), "quick")
+    found = problems(tampered_copy(release, tmp_path / "release", name, change), "quick")
     assert any(message in problem for problem in found), found
 
 
 def test_teammate_field_in_provenance_is_refused(release, tmp_path):
     """Regression: a teammate in provenance.json once replaced the teammate stored with the task."""
-    root = spoiled_copy(
+    root = tampered_copy(
         release, tmp_path / "r", PROVENANCE, lambda c: first_value(c)["teammate"].update(family="brdiv")
     )
     with pytest.raises(IndexFormatError, match="unknown field `family`"):
@@ -93,7 +93,7 @@ def test_verify_finds_false_values_in_a_release_without_tasks(converted_release,
         lines[1].update(seed=3)
         lines[0].update(task_id=lines[-1]["task_id"])
 
-    found = "\n".join(problems(spoiled_copy(converted_release, tmp_path / "r", HISTORIES, set_wrong_values), "quick"))
+    found = "\n".join(problems(tampered_copy(converted_release, tmp_path / "r", HISTORIES, set_wrong_values), "quick"))
     assert "history 1: seed: expected -1 without tasks, found 3" in found
     assert "of one task differ in" in found
 

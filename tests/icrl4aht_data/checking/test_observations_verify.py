@@ -13,7 +13,7 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.commands import run_cli
 from tests.helpers.published_files import KEPT
 from tests.helpers.random_releases import make_tasks
-from tests.helpers.spoiled import problems, spoiled_copy
+from tests.helpers.tampered import problems, tampered_copy
 
 
 class TestVerifyObservations:
@@ -46,7 +46,7 @@ class TestVerifyObservations:
         self, converted_release, tmp_path, change, message
     ):
         found = problems(
-            spoiled_copy(converted_release, tmp_path / "r", HISTORIES, lambda lines: lines[1].update(change))
+            tampered_copy(converted_release, tmp_path / "r", HISTORIES, lambda lines: lines[1].update(change))
         )
         assert any(message in line for line in found), found
 

@@ -26,7 +26,7 @@ from icrl4aht_data.writing.shard_writer import metadata_rows
 from tests.helpers.commands import run_cli
 from tests.helpers.damages import flip_bit
 from tests.helpers.random_releases import SHARD, make_tasks, one_history_release, random_history, random_release
-from tests.helpers.spoiled import problems, spoil
+from tests.helpers.tampered import problems, tamper
 
 
 def test_deep_verification_accepts_a_valid_release(lite_or_full):
@@ -98,7 +98,7 @@ def test_verify_finds_expert_returns_that_differ_from_provenance(tmp_path):
         assert (entry.expert_return, entry.expert_return_sampled, entry.expert_step) == (0, 16.9, 7)
         assert not problems(folder)
     wrong = {"expert_return": 0.5, "expert_return_sampled": None, "expert_step": 8}
-    spoil(root, HISTORIES, lambda lines: lines[0].update(wrong))
+    tamper(root, HISTORIES, lambda lines: lines[0].update(wrong))
     for (name, value), problem in zip(wrong.items(), problems(root), strict=True):
         assert f"history 0: {name} {value}, but meta/provenance.json has" in problem
 
@@ -124,7 +124,7 @@ def change_value(name, index, value):
     ],
 )
 def test_verify_finds_values_out_of_range(tmp_path, change, message):
-    root = one_history_release(tmp_path / "spoiled", change)
+    root = one_history_release(tmp_path / "tampered", change)
     for level in ("full", "deep"):
         found = problems(root, level)
         assert any(message in line for line in found), found
@@ -145,7 +145,7 @@ def test_verify_finds_values_out_of_range(tmp_path, change, message):
     ],
 )
 def test_deep_verification_finds_impossible_transitions(tmp_path, change, message):
-    root = one_history_release(tmp_path / "spoiled", change)
+    root = one_history_release(tmp_path / "tampered", change)
     assert problems(root) == [], "only --deep looks at the physics"
     found = problems(root, level="deep")
     assert any(message in line for line in found), found
@@ -160,7 +160,7 @@ def test_deep_verification_finds_observations_that_differ_from_the_state(tmp_pat
         return seen
 
     monkeypatch.setattr(release, "observe", wrong_observe)
-    root = one_history_release(tmp_path / "spoiled", kind="full")
+    root = one_history_release(tmp_path / "tampered", kind="full")
     assert problems(root) == []
     (found,) = problems(root, level="deep")
     assert found.endswith("obs: 1 steps differ from what their state shows, first step 17")
@@ -185,21 +185,21 @@ def test_verify_finds_the_chunk_table_of_another_shard(release_copy):
     ],
 )
 def test_verify_finds_false_index_lines(release_copy, change, message):
-    spoil(release_copy, HISTORIES, change)
+    tamper(release_copy, HISTORIES, change)
     assert any(message in problem for problem in problems(release_copy)), problems(release_copy)
 
 
 def test_verify_finds_a_shard_without_index_lines(tmp_path):
     random_release(tmp_path / "r", layouts=("cramped_up",), teammates=1, streams=2, shard_histories=1)
     assert problems(tmp_path / "r") == []
-    spoil(tmp_path / "r", INFO, lambda content: content.update(histories=1))
-    spoil(tmp_path / "r", HISTORIES, lambda lines: lines.pop())
+    tamper(tmp_path / "r", INFO, lambda content: content.update(histories=1))
+    tamper(tmp_path / "r", HISTORIES, lambda lines: lines.pop())
     found = problems(tmp_path / "r")
     assert any("00001-of-00002.h5: the name of" in problem for problem in found), found
 
 
 def test_verify_finds_episode_lengths_that_differ_from_info(release_copy):
-    spoil(release_copy, INFO, lambda content: content["environment"].update(kept_steps=40))
+    tamper(release_copy, INFO, lambda content: content["environment"].update(kept_steps=40))
     assert any("found 6 episodes in 120 steps" in p for p in problems(release_copy))
 
 

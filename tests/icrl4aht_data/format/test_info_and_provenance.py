@@ -24,9 +24,9 @@ def test_info_and_provenance_of_the_bundled_release_round_trip(tmp_path):
 
 
 def test_headroom_of_a_learned_teammate_uses_its_self_play_return():
-    assert not ReferenceEgos(2.0, 4.75, 6.0, 20).egos_differ
+    assert not ReferenceEgos(2.0, 4.75, 6.0, 20).returns_differ
     learned = ReferenceEgos(2.0, 4.75, 6.0, 20, self_play=10.0)
-    assert learned.egos_differ
+    assert learned.returns_differ
     assert learned.describe() == "stay 2.0, random 4.8, oracle 6.0, self-play 10.0"
     for references in (learned, ReferenceEgos(2.0, 4.75, 6.0, 20)):
         made = Provenance(references=references)

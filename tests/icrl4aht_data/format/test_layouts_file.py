@@ -25,7 +25,7 @@ from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.utils.text import listed_names
 from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import make_tasks, random_release
-from tests.helpers.spoiled import read_lines, spoil
+from tests.helpers.tampered import read_lines, tamper
 
 ROWS = ("WPWWW", "0A A1", "W   W", "WBWXW")
 OTHER = {"family": "other", "seed": None, "number": None}
@@ -120,16 +120,16 @@ class TestReleaseWithLayouts:
         ],
     )
     def test_invalid_stored_layouts_are_refused(self, root, fields, message):
-        spoil(root, LAYOUTS_FILE, lambda lines: lines[0].update(fields))
+        tamper(root, LAYOUTS_FILE, lambda lines: lines[0].update(fields))
         with pytest.raises(IndexFormatError, match=message):
             load_icrl4aht(root)
 
     def test_repeated_and_missing_lines_of_layouts_are_refused(self, root):
         (line,) = read_lines(root / LAYOUTS_FILE)
-        spoil(root, LAYOUTS_FILE, list.clear)
+        tamper(root, LAYOUTS_FILE, list.clear)
         with pytest.raises(IndexFormatError, match=r"unknown layout .*'mine-3-5'"):
             load_icrl4aht(root)
-        spoil(root, LAYOUTS_FILE, lambda lines: lines.extend([line, line]))
+        tamper(root, LAYOUTS_FILE, lambda lines: lines.extend([line, line]))
         with pytest.raises(IndexFormatError, match="line 2: layout 'mine-3-5' is listed twice"):
             load_icrl4aht(root)
 
@@ -144,7 +144,7 @@ class TestReleaseWithLayouts:
 
     def test_two_releases_cannot_use_one_name_for_different_maps(self, root):
         load_icrl4aht(root)
-        spoil(root, LAYOUTS_FILE, lambda lines: lines[0].update(map=["WWPWW", *ROWS[1:]]))
+        tamper(root, LAYOUTS_FILE, lambda lines: lines[0].update(map=["WWPWW", *ROWS[1:]]))
         with pytest.raises(IndexFormatError, match="give the new layout another name"):
             load_icrl4aht(root)
 

@@ -25,7 +25,7 @@ from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
 from icrl4aht_data.writing.release_folder import HISTORIES_INDEX
 from tests.helpers.random_releases import SHARD, one_history_release, random_release
-from tests.helpers.spoiled import first_value, problems, read_lines, spoiled_copy
+from tests.helpers.tampered import first_value, problems, read_lines, tampered_copy
 
 SCRIPT = ExpertLabels(None, "the oracle's", return_greedy=40.0, episodes=200)
 SOURCES = ("noise", "ppo", "ppo", "noise")
@@ -58,7 +58,7 @@ def lite_release(tmp_path_factory) -> Path:
             one["nearest_test"] = {"teammate": "H3/t1", "distance": 0.25}
         noise["nearest_test"]["behaviour"] = 3
 
-    return spoiled_copy(root, root.with_name("complete"), PROVENANCE, add_optional_fields)
+    return tampered_copy(root, root.with_name("complete"), PROVENANCE, add_optional_fields)
 
 
 def test_oracle_actions_learners_and_sources_round_trip(mixed_release):
@@ -139,7 +139,7 @@ def test_published_files_omit_oracle_actions_and_learner_numbers(lite_release, t
     ],
 )
 def test_verify_finds_wrong_index_lines_and_provenance(lite_release, tmp_path, name, change, message):
-    found = "\n".join(problems(spoiled_copy(lite_release, tmp_path / "release", name, change), "deep"))
+    found = "\n".join(problems(tampered_copy(lite_release, tmp_path / "release", name, change), "deep"))
     assert message in found
 
 

@@ -21,7 +21,7 @@ from icrl4aht_data.writing.convert import to_release
 from tests.helpers.commands import run_cli
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import random_release
-from tests.helpers.spoiled import read_lines
+from tests.helpers.tampered import read_lines
 
 DAY = datetime.date(2026, 1, 2)
 

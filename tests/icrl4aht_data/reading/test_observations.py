@@ -22,7 +22,7 @@ from icrl4aht_data.writing.release_folder import HISTORIES_INDEX
 from tests.helpers.batches import CACHES
 from tests.helpers.published_files import KEPT, SHARD
 from tests.helpers.random_releases import make_tasks, one_history_release, random_release, write_long_index
-from tests.helpers.spoiled import change_file, read_lines, spoil
+from tests.helpers.tampered import change_file, read_lines, tamper
 
 
 class TestConversion:
@@ -100,7 +100,7 @@ def edit_index_line(number: int, **fields: Any):
 
 class TestFaultyFiles:
     @pytest.mark.parametrize(
-        ("spoil", "message"),
+        ("tamper", "message"),
         [
             (
                 assign_values("/1/obs", (7, 1, 2, 3), 0.5),
@@ -144,10 +144,10 @@ class TestFaultyFiles:
             (edit_index_line(3, layout="nowhere"), r"index\.jsonl, line 4: unknown layout"),
         ],
     )
-    def test_faults_of_published_files_are_found(self, published_folder, tmp_path, spoil, message):
+    def test_faults_of_published_files_are_found(self, published_folder, tmp_path, tamper, message):
         files = shutil.copytree(published_folder[0], tmp_path / "files")
         with h5py.File(files / "histories.h5", "r+") as file:
-            change_file(files / HISTORIES_INDEX, lambda lines: spoil(file, lines))
+            change_file(files / HISTORIES_INDEX, lambda lines: tamper(file, lines))
         if message is None:
             from_published(files, tmp_path / "out", kept_steps=KEPT)
             assert verify_release(tmp_path / "out").ok
@@ -226,11 +226,11 @@ class TestMissingStates:
         write_long_index(tmp_path / "r")
         has = [number % 3 > 0 for number in range(3000)]
         change = {number: {"has_teammate_actions": value} for number, value in enumerate(has)}
-        spoil(tmp_path / "r", HISTORIES, lambda lines: [lines[number].update(change[number]) for number in change])
+        tamper(tmp_path / "r", HISTORIES, lambda lines: [lines[number].update(change[number]) for number in change])
         message = r"histories\.jsonl, line 1: expected has_teammate_actions true in a lite"
         with pytest.raises(IndexFormatError, match=message):
             load_icrl4aht(tmp_path / "r")
-        spoil(tmp_path / "r", INFO, lambda info: info.update(kind="observations"))
+        tamper(tmp_path / "r", INFO, lambda info: info.update(kind="observations"))
         assert load_icrl4aht(tmp_path / "r").column("has_teammate_actions").tolist() == has
 
 

@@ -21,7 +21,7 @@ from icrl4aht_data.writing.release_folder import HISTORIES_INDEX
 from tests.helpers.damages import file_contents
 from tests.helpers.published_files import KEPT
 from tests.helpers.random_releases import random_release
-from tests.helpers.spoiled import change_file
+from tests.helpers.tampered import change_file
 
 
 def copy_with_index_changes(source: Path, target: Path, changes: dict[int, dict[str, Any]]) -> Path:

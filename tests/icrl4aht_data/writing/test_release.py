@@ -83,7 +83,7 @@ def raise_error() -> list[NewHistory]:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "streams", "message"),
+    ("tamper", "streams", "message"),
     [
         (lambda a: a | {"rewards": a["rewards"] + 0.5}, 2, "values that int8 cannot represent"),
         (lambda a: a | {"actions": a["actions"][:-1], "state": a["state"][:-1]}, 2, "expected 49 rows, found 50"),
@@ -94,11 +94,11 @@ def raise_error() -> list[NewHistory]:
         (lambda a: a, 0, "has no histories; add at least one"),
     ],
 )
-def test_invalid_histories_are_refused_without_leftovers(tmp_path, spoil, streams, message):
+def test_invalid_histories_are_refused_without_leftovers(tmp_path, tamper, streams, message):
     with pytest.raises(OptionError, match=message):
         write_cramped_up_release(
             tmp_path / "out",
-            lambda: [NewHistory(k, spoil(random_arrays())) for k in (0, 1)],
+            lambda: [NewHistory(k, tamper(random_arrays())) for k in (0, 1)],
             streams,
             shard_histories=1,
         )

@@ -18,7 +18,7 @@ from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
 from tests.helpers.random_releases import random_release
-from tests.helpers.spoiled import problems, read_lines, spoil
+from tests.helpers.tampered import problems, read_lines, tamper
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_combined_releases_keep_changes_of_teammates(swap_release, lite, tmp_pat
 def test_verify_finds_invalid_episodes_of_teammate_changes(swap_release, tmp_path, spans):
     copy = tmp_path / "copy"
     to_release(load_icrl4aht(swap_release).select([0]), copy, "lite")
-    spoil(copy, HISTORIES, lambda lines: lines[0].update(teammate_of_episode=spans))
+    tamper(copy, HISTORIES, lambda lines: lines[0].update(teammate_of_episode=spans))
     found = problems(copy)
     assert any("expected ascending episodes from 0 to 5 at most" in problem for problem in found)
     assert any("teammate_of_episode" in problem and "provenance" in problem for problem in found)

@@ -28,8 +28,8 @@ from tests.servers.faults import Fault, LongBody, Redirect
 TABLE = "meta/chunks/teammate/coord_simple/train-00000-of-00001.npy"
 TERABYTE = 2**40
 
-Spoil = Callable[[Path], object]
-"""Called with the folder to spoil; its sibling `outside` has the files `secret.txt` and `secret.h5` and a pipe."""
+Tamper = Callable[[Path], object]
+"""Called with the folder to change; its sibling `outside` has the files `secret.txt` and `secret.h5` and a pipe."""
 Make = Callable[[Path, Path], object]
 """Called with a path where nothing exists and the root; creates something at the path."""
 ChangeFile = Callable[[Any, Path], object]
@@ -46,7 +46,7 @@ def policy_path(root: Path) -> str:
     return next((root / "teammates").glob("*/policy.safetensors")).relative_to(root).as_posix()
 
 
-def add_line(name: str) -> Spoil:
+def add_line(name: str) -> Tamper:
     """Return a function that adds a line to the manifest."""
 
     def append_line(root: Path) -> None:
@@ -56,7 +56,7 @@ def add_line(name: str) -> Spoil:
     return append_line
 
 
-def replace_file(name: str | Callable[[Path], str], make: Make) -> Spoil:
+def replace_file(name: str | Callable[[Path], str], make: Make) -> Tamper:
     """Return a function that removes a file or folder and calls `make` to create something in its place."""
 
     def replace_path(root: Path) -> None:
@@ -98,7 +98,7 @@ def deep_json(levels: int) -> Make:
     return file_writer('{"a":' * levels + "1" + "}" * levels)
 
 
-def change_json(name: str, change: Callable[[Any], Any]) -> Spoil:
+def change_json(name: str, change: Callable[[Any], Any]) -> Tamper:
     """Return a function that rewrites a JSON file; `change` edits the content in place or returns new content."""
 
     def rewrite_json(root: Path) -> None:
@@ -109,7 +109,7 @@ def change_json(name: str, change: Callable[[Any], Any]) -> Spoil:
     return rewrite_json
 
 
-def change_lines(change: Callable[[list[dict[str, Any]]], list | None], name: str = HISTORIES) -> Spoil:
+def change_lines(change: Callable[[list[dict[str, Any]]], list | None], name: str = HISTORIES) -> Tamper:
     """Return a function that rewrites a JSONL file; `change` edits the lines in place or returns new lines."""
 
     def rewrite_lines(root: Path) -> None:
@@ -121,17 +121,17 @@ def change_lines(change: Callable[[list[dict[str, Any]]], list | None], name: st
     return rewrite_lines
 
 
-def set_entry(name: str = HISTORIES, /, **changes: Any) -> Spoil:
+def set_entry(name: str = HISTORIES, /, **changes: Any) -> Tamper:
     """Return a function that changes fields of the first line of the index."""
     return change_lines(lambda values: values[0].update(changes), name)
 
 
-def change_info(**changes: Any) -> Spoil:
+def change_info(**changes: Any) -> Tamper:
     """Return a function that changes fields of info.json."""
     return change_json(INFO, lambda value: value.update(changes))
 
 
-def set_theta(**changes: Any) -> Spoil:
+def set_theta(**changes: Any) -> Tamper:
     """Return a function that changes parameters of the learned teammate and updates the id of its task."""
 
     def rewrite_task(root: Path) -> None:
@@ -148,7 +148,7 @@ def set_theta(**changes: Any) -> Spoil:
     return rewrite_task
 
 
-def change_table(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
+def change_table(change: Callable[[np.ndarray], np.ndarray | None]) -> Tamper:
     """Return a function that rewrites the chunk table; `change` edits the table in place or returns a new table."""
 
     def rewrite_table(root: Path) -> None:
@@ -165,7 +165,7 @@ def npy_header_only(header: str, version: bytes = b"\x01\x00", length: int | Non
     return file_writer(b"\x93NUMPY" + version + size.to_bytes(2 if version[0] == 1 else 4, "little") + header.encode())
 
 
-def change_hdf5(change: ChangeFile, name: str = SHARD) -> Spoil:
+def change_hdf5(change: ChangeFile, name: str = SHARD) -> Tamper:
     """Return a function that changes an HDF5 file without updating the chunk table."""
 
     def rewrite_hdf5(root: Path) -> None:
@@ -206,32 +206,32 @@ class Case(NamedTuple):
     Attributes:
         kind: "release", "published" (files of the published code) or "served" (by a faulty server).
         message: a regular expression that some error or finding must match.
-        spoil: function that damages a valid release or folder of published files.
+        tamper: function that damages a valid release or folder of published files.
         rules: faults of the server by path pattern, for a served release.
     """
 
     kind: str
     message: str
-    spoil: Spoil
+    tamper: Tamper
     rules: Mapping[str, Fault] = {}
 
 
 CASES: dict[str, Case] = {}
 
 
-def add_cases(kind: str, message: str, spoils: Mapping[str, Spoil]) -> None:
+def add_cases(kind: str, message: str, tamperings: Mapping[str, Tamper]) -> None:
     """Add hostile inputs of one kind that must be reported with the same message."""
-    for name, spoil in spoils.items():
-        add_case(f"{kind}: {name}", Case(kind, message, spoil))
+    for name, tamper in tamperings.items():
+        add_case(f"{kind}: {name}", Case(kind, message, tamper))
 
 
-def add_hashed_cases(message: str, spoils: Mapping[str, Spoil]) -> None:
+def add_hashed_cases(message: str, tamperings: Mapping[str, Tamper]) -> None:
     """Add hostile releases with a matching manifest, because an attacker can also write the manifest."""
 
-    def with_manifest(spoil: Spoil) -> Spoil:
-        return lambda root: (spoil(root), write_manifest(root))
+    def with_manifest(tamper: Tamper) -> Tamper:
+        return lambda root: (tamper(root), write_manifest(root))
 
-    add_cases("release", message, {name: with_manifest(spoil) for name, spoil in spoils.items()})
+    add_cases("release", message, {name: with_manifest(tamper) for name, tamper in tamperings.items()})
 
 
 def add_case(name: str, case: Case) -> None:
@@ -320,7 +320,7 @@ add_hashed_cases("SemVer", {"info: version with terminal codes": change_info(dat
 _nested = json.loads("[" * 400 + "]" * 400)
 _deep_theta = change_lines(lambda values: values[0]["teammate"]["theta"].update(x=_nested), TASKS)
 _deep_files = {f"deep: {name}": replace_file(name, deep_json(500)) for name in (INFO, PROVENANCE)}
-add_hashed_cases("found more levels", _deep_files | {"tasks: deep theta": _deep_theta})
+add_hashed_cases("levels, found more", _deep_files | {"tasks: deep theta": _deep_theta})
 _endless_line = file_writer(b"a" * 2**24)
 for _of, _file in {"index": HISTORIES, "tasks": TASKS}.items():
     add_hashed_cases("expected at most", {f"{_of}: one endless line": replace_file(_file, _endless_line)})
@@ -472,8 +472,8 @@ def inflating_published_chunks(file: Any, out: Path) -> None:
 
 _H5, _INDEX = "histories.h5", "histories_index.jsonl"
 for _message, _changes in _SHARED.items():
-    _spoils = {name: change_hdf5(change, _H5) for name, change in _changes.items()}
-    add_cases("published", f"group /0.*({_message})|cannot be read: .*{_message}", _spoils)
+    _tamperings = {name: change_hdf5(change, _H5) for name, change in _changes.items()}
+    add_cases("published", f"group /0.*({_message})|cannot be read: .*{_message}", _tamperings)
 _PUBLISHED = (_H5, _INDEX)
 for _message, _make in {
     "points outside": secret_link,

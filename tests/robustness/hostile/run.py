@@ -157,7 +157,7 @@ def run_in_folder(folder: Path, base: Path, case: Case) -> dict[str, Any]:
     shutil.copytree(base, root)
     make_outside_files(folder / "outside")
     out.mkdir()
-    case.spoil(root)
+    case.tamper(root)
     before = file_states(root), file_states(folder / "outside"), sorted(folder.iterdir())
     os.chdir(out)
     outcomes = {name: run_operation(step) for name, step in case_operations(case, root, out).items()}

@@ -42,7 +42,7 @@ class CoMeDi(Algorithm):
     mixed_play_weight: float = 1.0
 
     def assignment(self, environments: int) -> Assignment:
-        """Return the assignment of one member's environments.
+        """Assign policies to one member's environments.
 
         Raises:
             ValueError: if the number of environments is not a multiple of 8.

@@ -108,7 +108,7 @@ def _first_nonempty(mask: Bool[Array, " cells"], other: Bool[Array, " cells"]) -
 
 
 def _should_step_aside(scene: Scene) -> Bool[Array, ""]:
-    """Return whether agent 1 has empty hands and is adjacent to a partner who carries an item."""
+    """Return whether this is agent 1, empty-handed and adjacent to a partner who carries an item."""
     adjacent = scene.manhattan(scene.own_cell, scene.partner_cell) == 1
     return scene.holds_nothing & (scene.partner_hand > 0) & adjacent & (scene.slot == 1)
 

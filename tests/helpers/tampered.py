@@ -38,14 +38,14 @@ def change_file(path: Path, change: Change) -> None:
     path.write_text("".join(json.dumps(line) + "\n" for line in content) if is_lines else json.dumps(content))
 
 
-def spoil(root: Path, name: str, change: Change) -> None:
+def tamper(root: Path, name: str, change: Change) -> None:
     """Change a JSON or JSONL file of a release, and update the manifest with the file's new checksum."""
     change_file(root / name, change)
     write_manifest(root)
 
 
-def spoiled_copy(source: Path, target: Path, name: str, change: Change) -> Path:
-    """Copy a release and change one file of the copy by `spoil`."""
+def tampered_copy(source: Path, target: Path, name: str, change: Change) -> Path:
+    """Copy a release and change one file of the copy by `tamper`."""
     shutil.copytree(source, target)
-    spoil(target, name, change)
+    tamper(target, name, change)
     return target
