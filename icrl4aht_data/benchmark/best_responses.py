@@ -1,9 +1,9 @@
 """Best responses: for each teammate, the return of the best known ego with the benchmark's view.
 
 The file `cards/best_responses.json` stores the best responses. A best response is a recurrent ego that was trained with
-one teammate, or a model of the page of results that earned more than this ego in the episodes used to choose between
-them. On the track `preference` it is an informed ego, which also observes the task's number, see
-`icrl4aht_data.benchmark.adaptation`. Tasks share a best response if their teammates behave the same.
+one teammate, or a stored model of the page of results that earned more. On the track `preference` it is an informed
+ego, which also observes the task's number, see `icrl4aht_data.benchmark.adaptation`. Tasks share a best response if
+their teammates behave the same.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class BestResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         split: split of the tasks.
         tasks: ids of the tasks whose teammates show this behaviour.
         seeds: training runs of egos with a teammate of this behaviour.
-        best: mean return of the best ego, which is chosen by other episodes.
+        best: mean return of the best ego; training runs and models are chosen by other episodes.
         agent: name of the ego with the highest mean return over all seeds, such as "best response, seed 1".
     """
 

@@ -137,8 +137,8 @@ def _model_returns() -> dict[str, dict[str, Any]]:
     Results of controls, in which an ego's memory is cleared or another teammate plays, are left out.
     """
     from icrl4aht_baselines.online.responses import REPORT_SEEDS
-    from icrl4aht_baselines.report.comparison import read_stored, results_file
     from icrl4aht_baselines.report.results import bundled_tasks_by_id, task_label
+    from icrl4aht_baselines.report.stored_results import read_stored, results_file
 
     ids = {task_label(task): task for task in bundled_tasks_by_id("test", ALL_TRACKS)}
     stored = read_stored(results_file())

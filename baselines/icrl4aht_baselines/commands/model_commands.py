@@ -263,11 +263,12 @@ def submit_command(
     Results with a model's other way of choosing actions, such as `evaluate --sampled`, are shown in separate rows. A
     pull request that adds the file puts the agent on the page; `icrl4aht-data results FILE` shows a preview.
     """
-    from icrl4aht_baselines.report import comparison, submission
+    from icrl4aht_baselines.report import stored_results, submission
 
     check_output(out, overwrite)
     found = submission.make_submission(folders, submission.AgentFacts(**facts), name, update)
-    comparison.check_agent(comparison.read_stored(comparison.results_file()), found, ", ".join(map(str, folders)))
+    stored = stored_results.read_stored(stored_results.results_file())
+    stored_results.check_agent(stored, found, ", ".join(map(str, folders)))
     submission.write_submission(out, found)
     click.echo(f"wrote {out}: {found.agent}, {' and '.join(found.tracks)}; `icrl4aht-data results {out}` shows it")
 
@@ -290,17 +291,17 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
     and a figure (results.md and results.png), and all numbers (results.csv and results.parquet). No two agents may have
     the same name.
     """
-    from icrl4aht_baselines.report import comparison
+    from icrl4aht_baselines.report import comparison, stored_results
     from icrl4aht_baselines.report.submission import read_submission
 
     check_output(out, overwrite, comparison.RESULTS_FILES)
-    stored = comparison.read_stored(comparison.results_file())
+    stored = stored_results.read_stored(stored_results.results_file())
     for path in files:
         found = read_submission(path)
-        comparison.check_agent(stored, found, str(path))
-        stored = comparison.add_submission(stored, found)
+        stored_results.check_agent(stored, found, str(path))
+        stored = stored_results.add_submission(stored, found)
     if store:
-        comparison.write_stored(comparison.results_file(), stored)
+        stored_results.write_stored(stored_results.results_file(), stored)
     for path in comparison.write_comparison(stored, out):
         click.echo(f"wrote {path}")
 
@@ -314,7 +315,8 @@ def models_command() -> None:
     context, training layouts and sources, and whether actions are sampled by default.
     """
     from icrl4aht_baselines.agents.bundled import bundled_models, describe_model
-    from icrl4aht_baselines.report.comparison import describe_scores, read_stored, results_file
+    from icrl4aht_baselines.report.comparison import describe_scores
+    from icrl4aht_baselines.report.stored_results import read_stored, results_file
 
     models = bundled_models()
     scores = describe_scores(read_stored(results_file()), models)

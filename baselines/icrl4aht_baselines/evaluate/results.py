@@ -86,7 +86,7 @@ def read_result(path: Path) -> Result:
         content = json.loads(path.read_text(encoding="utf-8"))
         digest = content.pop("settings_hash")
         result = Result(**content)
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:  # ValueError: no JSON, or no UTF-8
         raise OptionError(f"{path}: not a result: {error!r}; remove the file and evaluate again") from error
     if digest != json_hash(result.settings):
         raise OptionError(f"{path}: the settings do not match their hash; remove the file and evaluate again")

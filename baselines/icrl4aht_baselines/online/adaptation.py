@@ -64,7 +64,7 @@ class AdaptationJob(EgoJob):
 
     @property
     def name(self) -> str:
-        """Name of the job's folder: set of tasks, kind of ego, width and seed."""
+        """Name of the job's folder: set of tasks, kind of ego, width, steps and seed."""
         return f"{self.title}-{self.kind}-{self.name_suffix}"
 
     @property

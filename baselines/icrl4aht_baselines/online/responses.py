@@ -7,7 +7,7 @@ a lower bound, because longer training or another learner may earn more. For com
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -48,7 +48,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import unknown_name
 from icrl4aht_data.utils.files import json_hash, parse_json, read_text, write_atomically
 from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.utils.text import markdown_table
+from icrl4aht_data.utils.text import counted_noun, markdown_table
 
 PROTOCOL = "seeded"
 """Protocol under which best responses are chosen and measured."""
@@ -66,7 +66,8 @@ ABOUT = (
     f"{CHOICE_SEEDS[0]} decide between training runs. Returns are means over tasks and the seeds "
     f"{', '.join(map(str, REPORT_SEEDS))}. For each of these seeds, the stored model that earns most with the other "
     "two is used instead if it earns more with them; in validation tasks, models are not compared. On the track "
-    "`preference`, best responses are informed egos, which observe the task's number."
+    "`preference`, best responses are informed egos, which observe the task's number, and returns are means over "
+    "training runs."
 )
 
 PLAY = PlayOptions(task_end=1.0)
@@ -132,8 +133,8 @@ class EgoJob(TrainingJob):
 
     @property
     def name_suffix(self) -> str:
-        """End of the job's name: width and seed, so that jobs of several widths can share an output folder."""
-        return f"w{self.options.width}-s{self.seed}"
+        """End of the job's name: width, steps and seed, so jobs that differ in these can share an output folder."""
+        return f"w{self.options.width}-{self.options.played_steps}-s{self.seed}"
 
     @property
     def model(self) -> ModelOptions:
@@ -180,7 +181,7 @@ class ResponseJob(EgoJob):
 
     @property
     def name(self) -> str:
-        """Name of the job's folder: id of the first task, initial model if any, width and seed."""
+        """Name of the job's folder: id of the first task, initial model if any, width, steps and seed."""
         start = f"-{self.options.init}" if self.options.init else ""
         return f"{self.tasks[0].task_id}{start}-{self.name_suffix}"
 
@@ -268,52 +269,57 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainingRun]
     """Return the best response to tasks whose teammates behave the same, from several training runs.
 
     The run with the highest mean return in episodes with the seeds `CHOICE_SEEDS` is chosen. The result's field `best`
-    is the mean return of this run in other episodes, with the seeds `REPORT_SEEDS`. Of several runs with the same seed,
+    is the mean return of this run in other episodes, with the seeds `REPORT_SEEDS`. For informed egos, which have no
+    returns in separate episodes, it is the mean over the runs with the most steps. Of several runs with the same seed,
     tasks, initial model, steps and width, only the last is used.
     """
     task, seeds = tasks[0], {(one.tasks, one.init, one.steps, one.width, one.seed): one for one in trainings}
-    best = best_training_run(seeds.values())
+    best, ego = _trained_ego(seeds.values())
     return BestResponse(
         layout=task.layout.name,
         family=task.teammate_family,
         split=task.split,
         tasks=tuple(one.task_id for one in tasks),
         seeds=tuple(seeds.values()),
-        best=best.mean_return,
-        agent=_ego_name(best),
+        best=best,
+        agent=ego,
     )
 
 
-def _ego_name(run: TrainingRun) -> str:
-    name = "best response" if run.tasks == 1 else "informed ego"
-    return f"{name}, seed {run.seed}" + (f" from {run.init}" if run.init else "")
+def _trained_ego(trainings: Collection[TrainingRun]) -> tuple[float, str]:
+    """Return the mean return of a best response's trained ego, and the ego's name."""
+    run = best_training_run(trainings)
+    if run.choice is None:
+        longest = [one.mean_return for one in trainings if (one.steps, one.width) == (run.steps, run.width)]
+        return float(np.mean(longest)), f"informed ego, {counted_noun(len(longest), 'run')}"
+    return run.mean_return, f"best response, seed {run.seed}" + (f" from {run.init}" if run.init else "")
 
 
 def include_models(found: BestResponse, models: Mapping[str, Mapping[str, np.ndarray]]) -> BestResponse:
     """Choose between the trained ego of a best response and stored models.
 
-    The return of an ego that is chosen by the reported episodes would be too high. Therefore an ego is chosen for each
+    The return of a model that is chosen by the reported episodes would be too high. Therefore an ego is chosen for each
     seed of `REPORT_SEEDS` separately: the model with the highest mean return with the other seeds, or the trained ego
-    if its return with `CHOICE_SEEDS` is as high. Field `best` of the result is the mean return of the chosen egos; the
-    trained ego counts with its mean over all seeds, because its returns by seed are not stored. Field `agent` is the
-    ego that would be chosen by all seeds.
+    if its mean return over all seeds is as high. (Its returns by seed are not stored; its return with `CHOICE_SEEDS` is
+    the highest of several runs, and thus too high for a comparison.) Field `best` of the result is the mean return of
+    the chosen egos. Field `agent` is the ego that would be chosen by all seeds.
 
     Args:
         found: best response; its training runs are used, and its fields `best` and `agent` are replaced.
         models: model -> task id -> mean return with each of `REPORT_SEEDS`, float64 (3,); models without results in all
             tasks of `found` are ignored.
     """
-    run = best_training_run(found.seeds)
-    found = structs.replace(found, best=run.mean_return, agent=_ego_name(run))
+    trained, ego = _trained_ego(found.seeds)
+    found = structs.replace(found, best=trained, agent=ego)
     names = [name for name, returns in models.items() if returns.keys() >= {*found.tasks}]
-    if not names or run.choice is None:  # without `choice`, egos can only be compared by the reported episodes
+    if not names:
         return found
     earned = np.array([np.mean([models[name][task] for task in found.tasks], axis=0) for name in names])
     others = (earned.sum(axis=1, keepdims=True) - earned) / (len(REPORT_SEEDS) - 1)  # shape (models, seeds)
     of_models = np.take_along_axis(earned, others.argmax(axis=0)[None], axis=0)[0]
-    best = np.where(others.max(axis=0) > run.choice, of_models, run.mean_return)
+    best = np.where(others.max(axis=0) > trained, of_models, trained)
     means = earned.mean(axis=1)
-    agent = names[int(means.argmax())] if means.max() > run.choice else found.agent
+    agent = names[int(means.argmax())] if means.max() > trained else ego
     return structs.replace(found, best=float(best.mean()), agent=agent)
 
 

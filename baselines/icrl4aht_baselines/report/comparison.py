@@ -1,21 +1,15 @@
-"""Results of agents that are stored in cards/results.csv.xz, and the page docs/results.md that compares them."""
+"""The page docs/results.md, which compares agents whose results are stored."""
 
 from __future__ import annotations
 
-import lzma
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
-import pandas as pd
 
 from icrl4aht_baselines.agents.egos import OTHER_WAYS
-from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.results import (
     EPISODE_BLOCKS,
@@ -23,10 +17,7 @@ from icrl4aht_baselines.report.results import (
     TEST_LAYOUTS,
     AgentReturns,
     ResultCell,
-    as_run,
-    bundled_tasks_by_id,
     mean_over_cells,
-    returns_by_cell,
     sorted_cells,
 )
 from icrl4aht_baselines.report.scores import (
@@ -40,22 +31,20 @@ from icrl4aht_baselines.report.scores import (
     score_difference,
 )
 from icrl4aht_baselines.report.statistics import MeanInterval, holm_corrected
-from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission
+from icrl4aht_baselines.report.stored_results import StoredResults
+from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.adaptation import published_adaptation_table
 from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
 from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE
 from icrl4aht_data.benchmark.reference_returns import read_reference_returns
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import add_legend_below, average_in_blocks, axis_limits, save_figure
 from icrl4aht_data.reading.arrow_tables import import_pyarrow
-from icrl4aht_data.utils.files import atomic_write, write_json
+from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.utils.text import card_file, fill_template, markdown_table
+from icrl4aht_data.utils.text import fill_template, markdown_table
 
 RESULTS_FILES = ("results.md", "results.png", "results.csv", "results.parquet")
-
-CURVE_COLUMNS = ["agent", "protocol", "control", "layout", "episode", "return"]
 
 _PANELS = 6
 _SIGNIFICANT = 0.05
@@ -86,128 +75,6 @@ is `PUBLISHED_TRACKS` or `PREFERENCE`."""
 
 PUBLISHED_TRACKS = "published"
 """Name for both published tracks together, over which M and P are averaged."""
-
-
-@dataclass(frozen=True)
-class StoredResults:
-    """Stored results of several agents: the content of the files results*.csv.xz and results.json in cards/.
-
-    Attributes:
-        table: table of results, see `results`.
-        curves: mean return in each episode on a published layout's test tasks, over tasks, seeds and training runs,
-            with the columns `CURVE_COLUMNS`.
-        agents: name of an agent -> facts that tables state; agents are shown in this order.
-    """
-
-    table: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=TABLE_COLUMNS))
-    curves: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=CURVE_COLUMNS))
-    agents: dict[str, AgentFacts] = field(default_factory=dict)
-
-    def returns(self, control: str = "") -> dict[str, AgentReturns]:
-        """Return agents' results on the test tasks under the protocol of docs/results.md, in the order of `agents`.
-
-        Args:
-            control: "cleared" or "swapped", see `protocols.CONTROLS`, or another play mode, see `OTHER_WAYS`; empty for
-                the agent's main results.
-        """
-        table = self.table
-        chosen = (table["protocol"] == SUBMITTED_PROTOCOL) & (table["control"] == control)
-        chosen &= table["kind"].isin(("test", PREFERENCE))
-        found = dict(iter(table[chosen].groupby("agent", sort=False)))
-        return {agent: returns_by_cell(found[agent]) for agent in [*self.agents] if agent in found}
-
-    def with_other_play_modes(self, results: Mapping[str, AgentReturns]) -> dict[str, AgentReturns]:
-        """Return `results` so that an agent's other way to act, such as "rl2 (greedy)", follows the agent."""
-        others, found = {way: self.returns(way) for way in OTHER_WAYS}, {}
-        for agent, own in results.items():
-            found[agent] = own
-            found |= {f"{agent} ({way})": of[agent] for way, of in others.items() if agent in of}
-        return found
-
-
-def results_file() -> Path:
-    """Return the path of results.json among the package's cards; the tables are stored next to this file."""
-    return card_file("best_responses.json").with_name("results.json")
-
-
-def _table_paths(path: Path) -> tuple[Path, Path]:
-    return path.with_suffix(".csv.xz"), path.with_name(f"{path.stem}_curves.csv.xz")
-
-
-def read_stored(path: Path) -> StoredResults:
-    """Return the results that are stored in a JSON file and in tables next to it.
-
-    Raises:
-        OptionError: if a file is missing or damaged.
-    """
-    table, curves = _table_paths(path)
-    try:
-        agents = msgspec.json.decode(path.read_bytes(), type=dict[str, AgentFacts])
-        kinds = {"task": str, "block": str}
-        frames = [pd.read_csv(file, keep_default_na=False, dtype=kinds) for file in (table, curves)]
-        return StoredResults(frames[0][TABLE_COLUMNS], frames[1][CURVE_COLUMNS], agents)
-    except (OSError, EOFError, lzma.LZMAError, ValueError, KeyError) as error:
-        raise OptionError(
-            f"{path}: not stored results: {error!r}; restore this file, {table.name} and {curves.name}"
-        ) from error
-
-
-def write_stored(path: Path, stored: StoredResults) -> None:
-    """Write results to a JSON file and two tables next to it. Results have three decimals, curves have two."""
-    for file, frame, digits in zip(_table_paths(path), (stored.table, stored.curves), (3, 2), strict=True):
-        with atomic_write(file) as partial:
-            text = frame.round(digits).to_csv(index=False, lineterminator="\n")
-            partial.write_bytes(lzma.compress(text.encode(), preset=lzma.PRESET_EXTREME | 9))  # half of gzip's size
-    with atomic_write(path) as partial:
-        write_json(partial, msgspec.to_builtins(stored.agents))
-
-
-def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
-    """Check that `Submission.update` is set if the submission's agent is already stored, and only then.
-
-    Raises:
-        OptionError: if `Submission.update` is set for an agent that is not stored, or not set for a stored agent.
-    """
-    known = {agent.casefold(): agent for agent in stored.agents}.get(found.agent.casefold())
-    if known and not found.update:
-        raise OptionError(
-            f"{where}: the page already has results of an agent {known}; give `icrl4aht-data submit` another --name, "
-            f"or --update if these are new results of the same agent"
-        )
-    if found.update and found.agent != known:
-        raise OptionError(f"{where}: updates the agent {found.agent}, which is not on the page; leave out --update")
-
-
-def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
-    """Return stored results plus submitted ones.
-
-    If `Submission.update` is set, they replace the agent's stored results on the same layouts.
-    """
-    controls = {one.control for one in found.evaluations}
-    tables, curves, tasks = [], defaultdict(list), [*bundled_tasks_by_id("test", tuple(found.tracks)).values()]
-    for one in found.evaluations:
-        run = as_run([Result(task, one.settings, returns) for task, returns in one.returns.items()], found.agent, tasks)
-        tables.append(run.table.assign(agent=found.agent, training=one.training, control=one.control))
-        for cell, returns in run.cells.items():
-            if cell.layout in TEST_LAYOUTS:  # the figure has no other layouts
-                curves[one.control, cell.layout].append(returns)
-    rows = [
-        (found.agent, SUBMITTED_PROTOCOL, control, layout, episode, value)
-        for (control, layout), parts in curves.items()
-        for episode, value in enumerate(np.concatenate(parts).mean(axis=0).tolist(), start=1)
-    ]
-
-    def replace_rows(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
-        is_replaced = (old["agent"] == found.agent) & (old["control"].isin(controls) | ("" in controls))
-        is_replaced &= old["layout"].isin(new["layout"].unique())
-        return pd.concat([part for part in (old[~is_replaced], new) if len(part)], ignore_index=True)
-
-    facts = found.facts if "" in controls else stored.agents[found.agent]
-    return StoredResults(
-        replace_rows(stored.table, pd.concat(tables, ignore_index=True)),
-        replace_rows(stored.curves, pd.DataFrame(rows, columns=CURVE_COLUMNS)),
-        stored.agents | {found.agent: facts},
-    )
 
 
 def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
@@ -396,7 +263,7 @@ def mean_best_return(layout: str, scales: CellScales) -> float | None:
 def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return table 3: mean return on each layout, with the score N in parentheses, worst teammate, and regret.
 
-    The first rows show `stay`, the oracle, the best responses, and the mean range of the training runs' returns.
+    The first rows show `stay`, the oracle, the best responses, and the mean range of equal training runs' returns.
     """
     scored, headroom = cells_with_headroom(scales), read_reference_returns(SUBMITTED_PROTOCOL)
     body = []
@@ -430,11 +297,13 @@ def _published_responses() -> list[BestResponse]:
 def training_ranges() -> dict[str, float]:
     """Return layout -> mean difference of the highest and lowest return of best responses' training runs.
 
-    The mean is over the test behaviours that have several training runs.
+    The mean is over the test behaviours that have several training runs with equal settings. The runs with the most
+    common settings are compared.
     """
-    returns = [
-        (one.layout, [run.mean_return for run in one.seeds]) for one in _published_responses() if len(one.seeds) > 1
-    ]
+    returns = []
+    for one in _published_responses():
+        alike = max(grouped(one.seeds, lambda run: (run.steps, run.width, run.init)).values(), key=len)
+        returns += [(one.layout, [run.mean_return for run in alike])] if len(alike) > 1 else []
     return {
         layout: float(np.mean([max(of) - min(of) for _, of in own]))
         for layout, own in grouped(returns, lambda item: item[0]).items()
@@ -453,8 +322,8 @@ def describe_training_runs() -> str:
     runs = _format_range([len(one.seeds) for one in behaviours], "d")
     return (
         f"Each of {len(behaviours)} behaviours of published test teammates has {runs} training "
-        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}; {started} runs fine-tuned a "
-        f"bundled model (its own training is not counted). For {models} behaviours a stored model earned more."
+        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. {started} runs with one seed fine-tuned "
+        f"a bundled model, whose own training is not counted. For {models} behaviours a stored model earned more."
     )
 
 

@@ -24,8 +24,9 @@ from icrl4aht_baselines.evaluate.results import RESULTS
 from icrl4aht_baselines.report.results import bundled_tasks_by_id, find_training_record, read_results
 from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_data.benchmark.best_responses import read_best_responses
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, TRACKS
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, KEPT_STEPS, TRACKS
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.utils.files import write_atomically
 from icrl4aht_data.utils.text import counted_noun
 
@@ -35,8 +36,17 @@ SUBMITTED_PROTOCOL = "seeded"
 SUBMITTED_SEEDS = (0, 1, 2)
 """Seeds that every task must be played with."""
 
-_Text = Annotated[str, Meta(min_length=1)]
-_NAME = r"^[^\s`|]([^\n`|]*[^\s`|])?$"  # no characters that would break a Markdown table
+_LARGEST = 2.0 * DELIVERY_REWARD * KEPT_STEPS
+"""Limit of an episode's absolute return: two agents deliver in every step."""
+
+# Texts are shown in Markdown: no line breaks, and no | in tables. Without the lookahead, $ accepts a break at the end.
+_NAME = r"^[^\s`|]([^\n`|]*[^\s`|])?$(?!\n)"
+_Sentence = Annotated[str, Meta(min_length=1, pattern=r"^[^\n\r]*$(?!\n)")]
+_CellText = Annotated[str, Meta(pattern=r"^[^\n\r|]*$(?!\n)")]
+_FullCellText = Annotated[str, Meta(min_length=1, pattern=r"^[^\n\r|]*$(?!\n)")]
+_Link = Annotated[str, Meta(pattern=r"^(https?://[^\s()<>|]+)?$(?!\n)")]
+_Commit = Annotated[str, Meta(pattern=r"^[0-9a-f]*$(?!\n)")]
+_Return = Annotated[float, Meta(ge=-_LARGEST, le=_LARGEST)]
 
 
 class AgentFacts(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -48,17 +58,17 @@ class AgentFacts(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True)
         labels: training targets in a few words, such as "oracle"; "none" without targets.
         steps: length of the training, such as "41 million steps a track".
         core_hours: core-hours of the training and of making its data.
-        link: address of a paper or repository.
+        link: http address of a paper or repository.
         commit: commit of this repository whose code made the agent, if later code cannot make it.
     """
 
-    about: _Text
-    data: _Text
-    labels: _Text
-    steps: str = ""
-    core_hours: float | None = None
-    link: str = ""
-    commit: str = ""
+    about: _Sentence
+    data: _FullCellText
+    labels: _FullCellText
+    steps: _CellText = ""
+    core_hours: Annotated[float, Meta(ge=0)] | None = None
+    link: _Link = ""
+    commit: _Commit = ""
 
 
 class Evaluation(msgspec.Struct, forbid_unknown_fields=True):
@@ -76,7 +86,7 @@ class Evaluation(msgspec.Struct, forbid_unknown_fields=True):
     control: str
     training: Annotated[int, Meta(ge=0)]
     settings: dict[str, Any]
-    returns: dict[str, list[list[float]]]
+    returns: Annotated[dict[str, list[list[_Return]]], Meta(min_length=1)]
     partners: dict[str, list[str]] = {}
 
 
@@ -98,9 +108,21 @@ class Submission(msgspec.Struct, forbid_unknown_fields=True):
     agent: Annotated[str, Meta(pattern=_NAME)]
     facts: AgentFacts
     best_responses: str
-    tracks: list[Literal["teammate", "layout", "preference"]]
+    tracks: Annotated[list[Literal["teammate", "layout", "preference"]], Meta(min_length=1)]
     evaluations: Annotated[list[Evaluation], Meta(min_length=1)]
     update: bool = False
+
+
+class _Details(msgspec.Struct):
+    model: str | None = None
+
+
+class _Settings(msgspec.Struct):
+    agent: str
+    protocol: dict[str, Any]
+    seeds: list[int]
+    code_version: str
+    details: _Details = msgspec.field(default_factory=_Details)
 
 
 def submission_schema() -> str:
@@ -119,10 +141,13 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
         update: see `Submission`.
 
     Raises:
-        OptionError: for the reasons of `check_submission`, or if a folder's results are missing or differ in settings.
+        OptionError: for the reasons of `check_submission`, if a folder is given twice, if its results are missing,
+            invalid or differ in settings, or if the folders' agents have different names and `agent` is empty.
     """
+    if twice := [folder for folder, number in Counter(map(Path.resolve, folders)).items() if number > 1]:
+        raise OptionError(f"{twice[0]}: given more than once; give each folder once")
     counts: Counter[tuple[str, str]] = Counter()  # (play mode, task) -> number of training runs so far
-    evaluations, tasks, training, way = [], set(), 0, ""
+    evaluations, tasks, names, training, way = [], set(), {}, 0, ""
     for folder in folders:
         for control in ("", *CONTROLS):
             source = folder / control
@@ -134,6 +159,7 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
                 raise OptionError(f"{source}: the results have different settings; evaluate all tasks again")
             if not control:  # controls in the same folder belong to the same training run
                 way = next((one for one in OTHER_WAYS if settings["agent"].endswith(f" ({one})")), "")
+                names[settings["agent"].removesuffix(f" ({way})")] = source
                 training = max(counts[way, result.task_id] for result in results)
                 counts.update((way, result.task_id) for result in results)
             returns = {result.task_id: result.returns for result in results}
@@ -141,21 +167,31 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
             partners = {result.task_id: result.partners for result in results if result.partners}
             evaluations.append(Evaluation(control or way, training, settings, returns, partners))
     tracks: Any = [track for track in ALL_TRACKS if tasks & bundled_tasks_by_id("test", (track,)).keys()] or [*TRACKS]
-    name = agent or evaluations[0].settings["agent"].removesuffix(f" ({evaluations[0].control})")
+    if len(names) > 1 and not agent:
+        texts = [f"{source} has results of {name}" for name, source in names.items()]
+        raise OptionError(
+            f"{', '.join(texts)}; give folders of one agent, or --name if these are training runs of one agent"
+        )
+    name = agent or next(iter(names))
     found = Submission(1, name, facts, read_best_responses().version, tracks, evaluations, update)
-    check_submission(found, ", ".join(map(str, folders)))
-    return found
+    return _parse_submission(msgspec.json.encode(found), ", ".join(map(str, folders)))
 
 
 def check_submission(found: Submission, where: str) -> None:
     """Check that a submission is complete and comparable, and states the training data.
 
     Raises:
-        OptionError: if the agent's name is taken by another agent or cannot be shown in tables, the best responses
-            have another version, the training data is not stated, protocol, seeds or episodes are not those of the
-            page, the tasks are not exactly those of the tracks, or the control `swapped` has other teammates than for
-            all tasks of a track.
+        OptionError: if settings are missing, the agent's name is taken by another agent or cannot be shown in tables,
+            the best responses have another version, the training data is not stated, protocol, seeds or episodes are
+            not those of the page, the tasks are not exactly those of the tracks, two training runs have equal returns,
+            a control has a training run that the main results lack, or the control `swapped` has other teammates than
+            for all tasks of a track.
     """
+    for one in found.evaluations:
+        try:
+            msgspec.convert(one.settings, _Settings)
+        except msgspec.ValidationError as error:
+            raise OptionError(f"{where}: settings: {error}; expected those that `evaluate` writes") from error
     _check_name(found, where)
     known = read_best_responses().version
     if found.best_responses != known:
@@ -166,12 +202,12 @@ def check_submission(found: Submission, where: str) -> None:
     expected = bundled_tasks_by_id("test", tuple(found.tracks))
     swapped = plan_tasks([*expected.values()], get_protocol(SUBMITTED_PROTOCOL), "swapped")
     partners = {plan.task.task_id: [*plan.partners] for plan in swapped}
-    played: dict[tuple[str, int], list[str]] = defaultdict(list)
+    played: dict[tuple[str, int], list[tuple[str, list[list[float]]]]] = defaultdict(list)
     for one in found.evaluations:
         part = f"{where}: {one.control or found.agent}, training {one.training}"
         if one.control not in ("", *CONTROLS, *OTHER_WAYS):
             raise OptionError(f"{part}: control {one.control!r}, expected {' or '.join((*CONTROLS, *OTHER_WAYS))}")
-        _check_evaluation(one, part)
+        _check_evaluation(one, part, found.tracks)
         for task in one.returns.keys() & partners if one.control == "swapped" else ():
             own = one.partners.get(task)
             if own != partners[task]:
@@ -180,17 +216,23 @@ def check_submission(found: Submission, where: str) -> None:
                     f"{part}: task {task} {found_text}, expected those of {partners[task]}; evaluate all tasks of the "
                     f"track with one command, and make the file again"
                 )
-        played[one.control, one.training] += one.returns
+        played[one.control, one.training] += one.returns.items()
     named = f"the {counted_noun(len(expected), 'test task')} of {' and '.join(found.tracks)}"
-    for (control, training), tasks in played.items():
+    runs, alike = {training for control, training in played if not control}, {}
+    for (control, training), results in played.items():
         part = f"{where}: {control or found.agent}, training {training}"
-        counts = Counter(tasks)
-        if wrong := sorted(task for task in {*tasks, *expected} if counts[task] != (task in expected)):
+        counts = Counter(task for task, _ in results)
+        if wrong := sorted(task for task in {*counts, *expected} if counts[task] != (task in expected)):
             raise OptionError(
                 f"{part}: expected one result of each of {named} and no others, found {counts[wrong[0]]} of {wrong[0]} "
                 f"({counted_noun(len(wrong), 'wrong task')}); evaluate exactly these tasks, and give each folder once"
             )
-    if not found.update and not any(one.control == "" for one in found.evaluations):
+        same = alike.setdefault((control, str(sorted(results))), training)
+        if same != training:
+            raise OptionError(f"{part}: the same returns as training {same}; give the results of a training run once")
+        if runs and training not in runs:
+            raise OptionError(f"{part}: no results without `{control}` of this training; give its folder, too")
+    if not found.update and not runs:
         raise OptionError(
             f"{where}: expected results of the agent's own play, found only results of controls or of "
             f"greedy or sampled actions; also give the folder of the expected results, or --update if the page has them"
@@ -201,8 +243,9 @@ def _check_name(found: Submission, where: str) -> None:
     own = [one for one in found.evaluations if not one.control] or found.evaluations
     models = {one.settings.get("details", {}).get("model") for one in own} & bundled_models().keys()
     # Further training runs of a bundled model have its name only together with the model's own results.
-    if found.agent in AGENTS or (found.agent in bundled_models() and models != {found.agent}):
-        raise OptionError(f"{where}: {found.agent} names a reference ego or a bundled model; give another --name")
+    taken = {name.casefold(): name for name in (*AGENTS, *bundled_models())}.get(found.agent.casefold())
+    if taken and not (found.agent == taken and models == {taken}):
+        raise OptionError(f"{where}: {taken} names a reference ego or a bundled model; give another --name")
     if not re.fullmatch(_NAME, found.agent) or found.agent.endswith(tuple(f" ({way})" for way in OTHER_WAYS)):
         raise OptionError(
             f"{where}: agent {found.agent!r}: expected one line without | and `, without spaces at its ends, and "
@@ -210,12 +253,9 @@ def _check_name(found: Submission, where: str) -> None:
         )
 
 
-def _check_evaluation(one: Evaluation, where: str) -> None:
+def _check_evaluation(one: Evaluation, where: str, tracks: Sequence[str]) -> None:
     rules = get_protocol(SUBMITTED_PROTOCOL)
-    try:
-        protocol, seeds, code = (one.settings[name] for name in ("protocol", "seeds", "code_version"))
-    except (KeyError, TypeError) as error:
-        raise OptionError(f"{where}: the settings have no {error}; expected results of `evaluate`") from error
+    protocol, seeds, code = (one.settings[name] for name in ("protocol", "seeds", "code_version"))
     if code != version("icrl4aht-data"):
         raise OptionError(
             f"{where}: made with icrl4aht-data {code}, but {version('icrl4aht-data')} is installed; evaluate again, or "
@@ -242,7 +282,8 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
             f"{where}: found control {' and '.join(sorted(marks)) or 'none'}, expected "
             f"{''.join(expected) or 'none'}; give the folder that `evaluate --controls` wrote"
         )
-    if None in find_training_record(one.settings, where).values():
+    record = find_training_record(one.settings, where)
+    if any(record[track] is None for track in record.keys() & {"", *tracks}):
         raise OptionError(
             f"{where}: no declaration of the training data; give `evaluate` details={{'{TRAINED_ON}': [...]}}, an "
             f"empty list for an agent that was not trained"
@@ -260,11 +301,15 @@ def read_submission(path: Path) -> Submission:
     Raises:
         OptionError: if the file is not a submission, or for the reasons of `check_submission`.
     """
+    return _parse_submission(path.read_bytes(), str(path))
+
+
+def _parse_submission(content: bytes, where: str) -> Submission:
     try:
-        found = msgspec.json.decode(path.read_bytes(), type=Submission)
+        found = msgspec.json.decode(content, type=Submission)
     except msgspec.MsgspecError as error:
         raise OptionError(
-            f"{path}: not a file of results: {error}; `icrl4aht-data submit` makes such files from `evaluate` results"
+            f"{where}: not valid results: {error}; `icrl4aht-data submit` makes a file from results of `evaluate`"
         ) from error
-    check_submission(found, str(path))
+    check_submission(found, where)
     return found

@@ -14,7 +14,8 @@ from icrl4aht_baselines.agents import bundled
 from icrl4aht_baselines.agents.bundled import EVERY_TRACK, MODEL_CARD, MODELS, bundle_run, bundled_models
 from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.report.comparison import describe_scores, read_stored, results_file
+from icrl4aht_baselines.report.comparison import describe_scores
+from icrl4aht_baselines.report.stored_results import read_stored, results_file
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from PIL import Image

@@ -86,8 +86,8 @@ def test_best_response_is_chosen_on_separate_episodes(tmp_path):
               {"better": (12.0, 9.0, 12.0), "lucky": (0.0, 0.0, 30.0), "worse": (8.0, 8.0, 8.0)}.items()}  # fmt: skip
     responses.write_responses(jobs, tmp_path, models | {"elsewhere": {"other": np.full(3, 50.0)}})
     (third,) = read_best_responses(path).behaviours
-    # With the other two seeds, `lucky` earns 15 for seeds 0 and 1, and `better` 10.5 for seed 2; the trained ego's
-    # choice is 10. Thus the chosen egos earn 0, 0 and 12 in the seeds that did not decide.
+    # With the other two seeds, `lucky` earns 15 for seeds 0 and 1, and `better` 10.5 for seed 2; the trained ego
+    # earns 9. Thus the chosen egos earn 0, 0 and 12 in the seeds that did not decide.
     assert (third.best, third.agent, third.seeds) == (4.0, "better", entry.seeds)
     row = "| demo_wide | test | H1 t0 | 4.0 | better | 9.0 to 20.0 | 2 | 400 | 128 | +0.0 |"
     assert row in responses.responses_table(tmp_path)
@@ -105,8 +105,10 @@ def test_best_response_is_chosen_on_separate_episodes(tmp_path):
     responses.write_responses([pair], tmp_path)
     order = [one.tasks for one in read_best_responses(path).behaviours]
     assert order == [(DEMO[2].task_id,), (DEMO[0].task_id, DEMO[1].task_id)]
-    other = ResponseJob(behaviour, 0, replace(TINY, steps=800), tmp_path)
-    assert not other.is_finished()  # the stored result has other settings
+    longer = ResponseJob(behaviour, 0, replace(TINY, steps=800), tmp_path)
+    assert longer.name != jobs[0].name, "runs of several lengths can share a folder"
+    same = ResponseJob(behaviour, 0, replace(TINY, learning_rate=0.5), tmp_path)
+    assert same.name == jobs[0].name and not same.is_finished(), "the stored result has other settings"
 
 
 def test_headroom_table_shows_mean_difference_and_interval(tmp_path):
@@ -183,8 +185,8 @@ def test_scripts_and_informed_egos_of_track_preference_are_stored(tmp_path, monk
     stored = read_best_responses(tmp_path / "best_responses.json").behaviours
     assert [one.tasks for one in stored] == [(task.task_id,) for task in every]
     assert {(one.best, one.agent, len(one.seeds), one.seeds[0].tasks) for one in stored} == {
-        (8.0, "informed ego, seed 0", 3, 20)
-    }, "the run with the most steps counts, and earlier runs are kept"
+        (8.0, "informed ego, 1 run", 3, 20)
+    }, "the runs with the most steps count, and earlier runs are kept"
 
 
 def test_headroom_tables_in_cards_and_docs_match_stored_results():

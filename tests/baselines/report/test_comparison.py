@@ -8,10 +8,11 @@ import lzma
 import numpy as np
 import pandas as pd
 import pytest
-from icrl4aht_baselines.report import comparison
-from icrl4aht_baselines.report.comparison import SecondaryEffect, StoredResults
+from icrl4aht_baselines.report import comparison, stored_results
+from icrl4aht_baselines.report.comparison import SecondaryEffect
 from icrl4aht_baselines.report.scores import add_scales, cell_scales
 from icrl4aht_baselines.report.statistics import MeanInterval, holm_corrected
+from icrl4aht_baselines.report.stored_results import StoredResults
 from icrl4aht_baselines.report.submission import AgentFacts, make_submission
 from msgspec import structs
 
@@ -38,7 +39,7 @@ def stored(tmp_path_factory) -> StoredResults:
     write_results(folder / "low", "low", LOW)
     found = StoredResults()
     for name in ("high", "low"):
-        found = comparison.add_submission(found, make_submission([folder / name], FACTS))
+        found = stored_results.add_submission(found, make_submission([folder / name], FACTS))
     return found
 
 
@@ -55,8 +56,8 @@ def test_stored_results_have_episode_blocks_and_curves_and_can_be_read_again(sto
     assert len(stored.table) == 4 * 40 * 3 * 6 and len(stored.curves) == 4 * 2 * 100
     curve = stored.curves[(stored.curves["agent"] == "high") & (stored.curves["control"] == "")]
     assert curve["return"].tolist() == [value + 2.0 for value in HIGH] * 2, "mean over the five teammates"
-    comparison.write_stored(tmp_path / "results.json", stored)
-    again = comparison.read_stored(tmp_path / "results.json")
+    stored_results.write_stored(tmp_path / "results.json", stored)
+    again = stored_results.read_stored(tmp_path / "results.json")
     assert again.agents == stored.agents
     pd.testing.assert_frame_equal(again.table, stored.table, check_dtype=False)
     pd.testing.assert_frame_equal(again.curves, stored.curves, check_dtype=False)
@@ -84,7 +85,7 @@ def test_differences_are_between_agents_with_neighbouring_scores(tmp_path, inven
     for name, value in {"a": 3.0, "b": 9.0, "c": 5.0}.items():
         returns = dict.fromkeys(one.evaluations[0].returns, [[value] * 100] * 3)
         of_agent = structs.replace(one, agent=name, evaluations=[structs.replace(one.evaluations[0], returns=returns)])
-        found = comparison.add_submission(found, of_agent)
+        found = stored_results.add_submission(found, of_agent)
     assert comparison.describe_differences(effects(found)) == (
         "* Track `teammate`: `b` - `c` **+0.20 (+0.20 to +0.20)**, `c` - `a` **+0.10 (+0.10 to +0.10)**."
     )
@@ -117,7 +118,7 @@ def test_results_on_track_preference_have_their_own_columns_and_rows(stored, tmp
     write_invented_responses(tmp_path / "both.json", preference=True)
     write_results(tmp_path / "high", "high", [12.0] * 100, PREFERENCE)
     write_results(tmp_path / "high" / "cleared", "high (cleared)", [5.0] * 100, PREFERENCE, forget=True)
-    more = comparison.add_submission(stored, make_submission([tmp_path / "high"], FACTS, update=True))
+    more = stored_results.add_submission(stored, make_submission([tmp_path / "high"], FACTS, update=True))
     assert len(more.table) == len(stored.table) + 2 * 120 * 3 * 6, "results on the track layout are kept"
     assert len(more.curves) == len(stored.curves), "the figure shows published layouts only"
     scales, found = cell_scales("seeded"), effects(more)
@@ -126,7 +127,7 @@ def test_results_on_track_preference_have_their_own_columns_and_rows(stored, tmp
     table = comparison.agents_table(more, more.returns(), scales, found)
     assert "| N, layout | IQM, layout | N, preference | IQM, preference |" in table
     high, low = agent_row(table, "high"), agent_row(table, "low")
-    assert high[8].startswith("**0.51 (") and low[8:] == ["–"]
+    assert high[8].startswith("**0.51 (") and low[8:] == ["–", "–"]
     assert high[:8] == agent_row(comparison.agents_table(stored, stored.returns(), scales, effects(stored)), "high")[:8]
     lines = comparison.controls_table(more.returns(), scales, found).splitlines()
     rows = [line for line in lines if PREFERENCE in line]
@@ -183,34 +184,34 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
 @pytest.mark.parametrize("texts", ["{", "[]", '{"a": {}}', "{}"])
 def test_damaged_stored_results_raise_error(texts, tmp_path):
     with pytest.raises(OptionError, match=r"none\.json: not stored results: FileNotFoundError.*restore this file"):
-        comparison.read_stored(tmp_path / "none.json")
+        stored_results.read_stored(tmp_path / "none.json")
     (tmp_path / "bad.json").write_text(texts)
     (tmp_path / "bad.csv").write_text("agent,protocol\n")
     with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*this file, bad\.csv\.xz and bad_curves"):
-        comparison.read_stored(tmp_path / "bad.json")
+        stored_results.read_stored(tmp_path / "bad.json")
 
 
 @pytest.mark.parametrize("part", [slice(40), slice(10, None)])
 def test_damaged_tables_of_stored_results_raise_error(part, stored, tmp_path):
     """A table is cut at its end or its start."""
-    comparison.write_stored(tmp_path / "cut.json", stored)
+    stored_results.write_stored(tmp_path / "cut.json", stored)
     path = tmp_path / "cut.csv.xz"
     path.write_bytes(path.read_bytes()[part])
     with pytest.raises(OptionError, match=r"cut\.json: not stored results: .*restore this file, cut\.csv\.xz"):
-        comparison.read_stored(tmp_path / "cut.json")
+        stored_results.read_stored(tmp_path / "cut.json")
 
 
 def test_bundled_results_are_unchanged_if_written_again(tmp_path):
-    comparison.write_stored(tmp_path / "results.json", comparison.read_stored(comparison.results_file()))
+    stored_results.write_stored(tmp_path / "results.json", stored_results.read_stored(stored_results.results_file()))
     for name in ("results.json", "results.csv.xz", "results_curves.csv.xz"):
         opened = lzma.open if name.endswith(".xz") else open
-        with opened(tmp_path / name) as written, opened(comparison.results_file().with_name(name)) as bundled:
+        with opened(tmp_path / name) as written, opened(stored_results.results_file().with_name(name)) as bundled:
             assert written.read() == bundled.read()
 
 
 @pytest.mark.slow
 def test_committed_results_page_matches_the_stored_results(monkeypatch):
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: card_file("best_responses.json"))
-    stored = comparison.read_stored(comparison.results_file())
+    stored = stored_results.read_stored(stored_results.results_file())
     assert (ROOT / "docs" / "results.md").read_text(encoding="utf-8") == comparison.render_comparison(stored)
     assert len(pd.read_parquet(ROOT / "docs" / "results.parquet")) == len(stored.table)

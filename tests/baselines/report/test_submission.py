@@ -9,14 +9,16 @@ from typing import Any
 
 import pytest
 from icrl4aht_baselines.evaluate.results import read_result
-from icrl4aht_baselines.report import comparison
+from icrl4aht_baselines.report import comparison, stored_results
 from icrl4aht_baselines.report.submission import AgentFacts, make_submission, read_submission, write_submission
 
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.files import json_hash
 from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import TEST_TASKS, write_results
 
 CURVE = [0.0, *[10.0] * 4, *[20.5] * 95]
+OTHER_CURVE = [1.0, *CURVE[1:]]
 FACTS = AgentFacts("a rule", "none", "none")
 
 
@@ -25,7 +27,7 @@ def submission_file(tmp_path_factory) -> Path:
     """Write a submission of two training runs of an agent; the second run also has results with memory cleared."""
     folder = tmp_path_factory.mktemp("submitted")
     write_results(folder / "one", "rule", CURVE)
-    write_results(folder / "two", "rule", CURVE, trained_on=[{"layout": "asymm_both", "family": "H1"}])
+    write_results(folder / "two", "rule", OTHER_CURVE, trained_on=[{"layout": "asymm_both", "family": "H1"}])
     write_results(folder / "two" / "cleared", "rule (cleared)", [0.0] * 100, forget=True)
     write_submission(folder / "rule.json", make_submission([folder / "one", folder / "two"], FACTS))
     return folder / "rule.json"
@@ -63,11 +65,26 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c, one, task: c.update(agent="search"), "search names a reference ego or a bundled model; give"),
+        (lambda c, one, task: c.update(agent="Search"), "search names a reference ego or a bundled model; give"),
         (lambda c, one, task: c.update(agent="dpt-reference"), "dpt-reference names a reference ego or a bundled"),
         (lambda c, one, task: name_only_control(c, "dpt-reference"), "names a reference ego or a bundled"),
         (lambda c, one, task: c.update(agent="rule (greedy)"), "without a play mode at the end"),
-        (lambda c, one, task: c.update(agent="a | b"), "not a file of results: .*matching regex"),
+        (lambda c, one, task: c.update(agent="a | b"), "not valid results: .*matching regex"),
+        (lambda c, one, task: c.update(agent="rule\n"), "not valid results: .*matching regex"),
+        (lambda c, one, task: c["facts"].update(data="x | **0.99**"), r"matching regex .* at `\$\.facts\.data`"),
+        (lambda c, one, task: c["facts"].update(about="a\n# b"), r"matching regex .* at `\$\.facts\.about`"),
+        (lambda c, one, task: c["facts"].update(link="javascript:x"), r"matching regex .* at `\$\.facts\.link`"),
+        (lambda c, one, task: c["facts"].update(core_hours=-1), r"Expected `float` >= 0.* at `\$\.facts\.core_hours`"),
+        (lambda c, one, task: c.update(tracks=[]), r"length >= 1 - at `\$\.tracks`"),
+        (lambda c, one, task: one["returns"].clear(), r"length >= 1 - at `\$\.evaluations\[0\]\.returns`"),
+        (lambda c, one, task: one["returns"].update({task: None}), "Expected `array`, got `null`"),
+        (lambda c, one, task: one["returns"][task][0].append(None), "Expected `float`, got `null`"),
+        (lambda c, one, task: one["returns"][task][0].append(1e9), "Expected `float` <= 4000"),
+        (lambda c, one, task: one["settings"].pop("agent"), "settings: Object missing required field `agent`"),
+        (lambda c, one, task: one["settings"].update(details=None), r"settings: .*got `null` - at `\$\.details`"),
+        (lambda c, one, task: one["settings"]["details"].update(model=[]), r"got `array` - at `\$\.details\.model`"),
+        (lambda c, one, task: c["evaluations"][1].update(returns=one["returns"]), "1: the same returns as training 0"),
+        (lambda c, one, task: c["evaluations"][2].update(training=2), "2: no results without `cleared` of this"),
         (lambda c, one, task: c.update(best_responses="99"), r"best responses '99', but this package has '0'"),
         (lambda c, one, task: one["settings"]["details"].clear(), "no declaration of the training data"),
         (lambda c, one, task: one["settings"]["protocol"].update(four_recipes=True), "'four_recipes': True"),
@@ -106,7 +123,30 @@ def test_control_swapped_needs_the_teammates_of_the_complete_track(tmp_path):
         make_submission([tmp_path / "mine"], FACTS)
 
 
+def test_training_data_can_be_declared_for_the_submitted_track_alone(tmp_path):
+    folder = write_results(tmp_path / "mine", "mine", CURVE)
+    for path in (folder / "tasks").iterdir():
+        content = json.loads(path.read_text())
+        content["settings"]["details"]["trained_on"] = {"layout": []}
+        path.write_text(json.dumps(content | {"settings_hash": json_hash(content["settings"])}))
+    assert make_submission([folder], FACTS).tracks == ["layout"]
+
+
 def test_results_that_cannot_be_submitted_raise_errors(tmp_path):
+    one, other = (write_results(tmp_path / name, name, CURVE) for name in ("one", "other"))
+    with pytest.raises(OptionError, match="one: given more than once; give each folder once"):
+        make_submission([one, tmp_path / "none" / ".." / "one"], FACTS)
+    with pytest.raises(OptionError, match=r"one has results of one, .*other has results of other; give folders of one"):
+        make_submission([one, other], FACTS)
+    with pytest.raises(OptionError, match="training 1: the same returns as training 0"):
+        make_submission([one, other], FACTS, "both")
+    path = next((one / "tasks").iterdir())
+    path.write_text(path.read_text().replace("20.5", "NaN"))
+    with pytest.raises(OptionError, match="one: not valid results: Expected `float`, got `null`"):
+        make_submission([one], FACTS)
+    path.write_bytes(b"\xff")
+    with pytest.raises(OptionError, match=f"{path.name}: not a result: UnicodeDecodeError"):
+        make_submission([one], FACTS)
     with pytest.raises(OptionError, match=f"{tmp_path}/none: no results in"):
         make_submission([tmp_path / "none"], FACTS)
     folder = write_results(tmp_path / "undeclared", "rule", CURVE, trained_on=None)
@@ -124,8 +164,8 @@ def test_results_that_cannot_be_submitted_raise_errors(tmp_path):
 
 
 def test_submit_and_results_commands_write_file_and_page(submission_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(comparison, "results_file", lambda: tmp_path / "stored.json")
-    comparison.write_stored(tmp_path / "stored.json", comparison.StoredResults())
+    monkeypatch.setattr(stored_results, "results_file", lambda: tmp_path / "stored.json")
+    stored_results.write_stored(tmp_path / "stored.json", stored_results.StoredResults())
     folder = str(write_results(tmp_path / "mine", "mine", CURVE))
     said = ["--about", "a rule", "--data", "none", "--labels", "none", "--core-hours", "1.5", "--name", "my rule"]
     printed = run_cli("submit", folder, *said, "--out", tmp_path / "mine.json")
@@ -138,7 +178,7 @@ def test_submit_and_results_commands_write_file_and_page(submission_file, tmp_pa
     text = (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
     assert "| `my rule` | none | none | 1.5 core-hours |" in text and "| `rule` † |" in text
     run_cli(*page, "--overwrite", "--store")
-    assert list(comparison.read_stored(tmp_path / "stored.json").agents) == ["rule", "my rule"]
+    assert list(stored_results.read_stored(tmp_path / "stored.json").agents) == ["rule", "my rule"]
     said = ["submit", folder, *said[:-1], "Rule", "--out", str(tmp_path / "again.json")]
     for words, message in (
         ([*page, "--overwrite"], "the page already has results of an agent rule;"),
@@ -157,10 +197,10 @@ def test_results_with_sampled_actions_are_added_to_an_agent(tmp_path):
     write_results(drawn / "cleared", "mine (sampled) (cleared)", CURVE, sampled=True, forget=True)
     both = make_submission([drawn, own], FACTS)
     assert (both.agent, [one.control for one in both.evaluations]) == ("mine", ["sampled", ""])
-    stored = comparison.add_submission(comparison.StoredResults(), make_submission([own], FACTS))
+    stored = stored_results.add_submission(stored_results.StoredResults(), make_submission([own], FACTS))
     with pytest.raises(OptionError, match="expected results of the agent's own play, found only results of "):
         make_submission([drawn], FACTS)
-    later = comparison.add_submission(stored, make_submission([drawn], AgentFacts("x", "x", "x"), update=True))
+    later = stored_results.add_submission(stored, make_submission([drawn], AgentFacts("x", "x", "x"), update=True))
     assert len(later.table) == 2 * len(stored.table) and later.agents == {"mine": FACTS}
     shown = later.with_other_play_modes(later.returns())
     assert list(shown) == ["mine", "mine (sampled)"]
@@ -168,5 +208,13 @@ def test_results_with_sampled_actions_are_added_to_an_agent(tmp_path):
     assert "| `mine` | none | none | – | – | – |" in table and "| `mine (sampled)` |  |  |  | – |" in table
     page = comparison.render_comparison(later)
     assert "Not measured for" not in page and "Not measured for: `mine`." in comparison.render_comparison(stored)
-    replaced = comparison.add_submission(later, make_submission([own], FACTS, update=True))
+    two = [
+        write_results(tmp_path / f"{run}", "mine", curve, track="teammate")
+        for run, curve in enumerate((CURVE, OTHER_CURVE))
+    ]
+    with pytest.raises(
+        OptionError, match=r"mine.json: .* would have training runs \[0, 1\] on coord_ring, but \[0\] in its"
+    ):
+        stored_results.check_agent(later, make_submission(two, FACTS, update=True), "mine.json")
+    replaced = stored_results.add_submission(later, make_submission([own], FACTS, update=True))
     assert set(replaced.table["control"]) == {""}
