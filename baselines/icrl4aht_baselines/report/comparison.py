@@ -322,8 +322,8 @@ def describe_training_runs() -> str:
     runs = _format_range([len(one.seeds) for one in behaviours], "d")
     return (
         f"Each of {len(behaviours)} behaviours of published test teammates has {runs} training "
-        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. {started} runs of one seed fine-tuned "
-        f"a bundled model, whose own training is not counted. For {models} behaviours a stored model earned more."
+        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. {started} runs of one seed fine-tuned"
+        f" a bundled model, whose own training is not counted. For {models} behaviours a stored model earned more."
     )
 
 
