@@ -18,7 +18,7 @@ def published_rooms(test: bool) -> dict[tuple[str, ...], list[np.ndarray]]:
     """Return the rooms of published layouts that are reserved for tests, or those that are not, without repeats.
 
     Args:
-        tested: False for the rooms of asymm_both and cramped_up, the layouts that are only used in training, although
+        test: False for the rooms of asymm_both and cramped_up, the layouts that are only used in training, although
             test layouts have these rooms too; True for all other rooms, which are reserved for tests.
 
     Returns:
@@ -28,7 +28,7 @@ def published_rooms(test: bool) -> dict[tuple[str, ...], list[np.ndarray]]:
     found: dict[tuple[str, ...], list[np.ndarray]] = {}
     for layout in map(get_layout, LAYOUT_NAMES):
         floor = _layout_floor(layout)
-        if (floor not in trained) == tested:
+        if (floor not in trained) == test:
             pairs = zip(*map(symmetric_images, agent_rooms(layout)), strict=True)
             found.setdefault(floor, [np.stack(pair) for pair in pairs])
     return found

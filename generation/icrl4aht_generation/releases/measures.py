@@ -39,7 +39,7 @@ from icrl4aht_generation.teammates.draws import unusable_reason, usable_families
 from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_egos, reference_returns
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate
-from icrl4aht_generation.teammates.spread import find_measured
+from icrl4aht_generation.teammates.spread import find_measured, read_spread
 
 T = TypeVar("T")
 
@@ -210,4 +210,30 @@ def unusable_families(layouts: Iterable[str]) -> list[LeftOutTask]:
         if layout in TESTED_ON
         for family in HEURISTIC_FAMILIES
         if family not in usable_families(layout)
+    ]
+
+
+def few_spread_teammates(per_layout: Mapping[str, int]) -> list[LeftOutTask]:
+    """Return training layouts with fewer spread teammates than others, with the reasons; none without headroom.
+
+    Args:
+        per_layout: number of spread training teammates in a release, by layout, see `teammates.spread`.
+    """
+    most = max(per_layout.values())
+    spreads = (read_spread(layout) for layout in TESTED_ON if per_layout.get(layout, most) < most)
+    return [
+        LeftOutTask(
+            "",
+            spread.layout,
+            "spread",
+            "",
+            0,
+            0,
+            None,
+            None,
+            f"{spread.unlike_tests} of {spread.tried} candidates act unlike test teammates, {spread.headroom} of these "
+            "have headroom",
+        )
+        for spread in spreads
+        if spread.headroom
     ]

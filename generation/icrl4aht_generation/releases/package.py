@@ -42,6 +42,7 @@ from icrl4aht_generation.profiles import Profile, WorkUnit
 from icrl4aht_generation.releases.labeller import choose_labeller
 from icrl4aht_generation.releases.measures import (
     TeammateFacts,
+    few_spread_teammates,
     recorded_provenance,
     release_provenance,
     unusable_families,
@@ -178,6 +179,8 @@ def package_release(
         raise OptionError(f"{target}: no task has histories to keep: {reasons}")
     if profile.sampled is not None:
         omitted += unusable_families(profile.layouts)
+    if profile.spread is not None:
+        omitted += few_spread_teammates(profile.spread.per_layout)
     with TemporaryDirectory() as folder:
         files = {CURVES_FIGURE: Path(folder) / "curves.png"}
         save_figure(plot_source_curves(curves), files[CURVES_FIGURE], dpi=80)

@@ -14,7 +14,12 @@ from icrl4aht_generation.collection.curate import oracle_labels
 from icrl4aht_generation.collection.task_folder import HISTORY_ARRAYS, LABELLER_RETURNS, METADATA
 from icrl4aht_generation.profiles import Profile, WorkUnit, load_profile
 from icrl4aht_generation.releases import measures
-from icrl4aht_generation.releases.measures import TeammateFacts, teammate_facts, unusable_families
+from icrl4aht_generation.releases.measures import (
+    TeammateFacts,
+    few_spread_teammates,
+    teammate_facts,
+    unusable_families,
+)
 from icrl4aht_generation.releases.package import package_release, recorded_sources
 from icrl4aht_generation.teammates import draws as draws_table
 from icrl4aht_generation.teammates.draws import Draw, find_draw
@@ -262,6 +267,14 @@ def test_families_without_usable_draws_are_reported_with_the_reason(monkeypatch)
     (found,) = unusable_families(["demo_wide", "cramped_down"])
     assert (found.layout, found.teammate, found.source) == ("demo_wide", "H4", "")
     assert found.reason == "all 2 draws act like a test teammate of the family (distance 0.010 at most)"
+
+
+def test_layouts_with_fewer_spread_teammates_are_listed_with_the_reason():
+    """On coord_simple no teammate has headroom, which the card says of the layout."""
+    assert few_spread_teammates({"coord_simple": 2, "test_wide": 2}) == []
+    (found,) = few_spread_teammates({"coord_simple": 2, "coord_ring": 2, "test_wide": 24})
+    assert (found.layout, found.teammate) == ("coord_ring", "spread")
+    assert found.reason == "156 of 247 candidates act unlike test teammates, 3 of these have headroom"
 
 
 @pytest.mark.slow
