@@ -94,9 +94,9 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
 
 
 def _check_disjoint_teammates(tasks: Iterable[Task], report: Report) -> None:
-    """Check that no test or held-out task has the teammate of a training task on the same track and layout."""
+    """Check that no task of another split has the teammate of a training task on the same track and layout."""
     seen: dict[tuple[str, str, str], str] = {}
-    for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # training tasks come before test tasks
+    for task in sorted(tasks, key=lambda task: task.split != "train"):  # training tasks come first
         key = (task.track, task.layout.name, json.dumps(task.teammate, sort_keys=True))
         if task.split == "train":
             seen[key] = task.task_id

@@ -252,7 +252,7 @@ def _warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
     else:
         references = [dataset.provenance.of(name).references for name in names]
         earned = np.array([np.nan if one is None else one.oracle for one in references])
-        advice = "leave these tasks out, or take expert as labels"
+        advice = "leave these tasks out"
     weak = np.flatnonzero(are_labels_weak(earned, ends))
     if not len(weak):
         return

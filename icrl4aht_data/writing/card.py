@@ -327,7 +327,8 @@ def _behaviour_counts(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Count teammates with known behaviour and distinct behaviours by split, and behaviours that both splits share.
 
     The behaviours of spread teammates, which all differ from each other, and of drawn teammates are numbered
-    separately, so a spread and a drawn teammate always count as different.
+    separately, so a spread and a drawn teammate always count as different. With spread teammates, the number of shared
+    behaviours is None.
     """
     known = [row for row in teammates if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None]
     found = {
@@ -337,7 +338,9 @@ def _behaviour_counts(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
         for split, own in grouped(known, lambda row: row["split"]).items()
     }
     counts = {split: (len(found[split]), len(set(found[split]))) for split in SPLITS if split in found}
-    return {"behaviours": counts, "shared_behaviours": len({*found.get("train", ())} & {*found.get("validation", ())})}
+    shared = len({*found.get("train", ())} & {*found.get("validation", ())})
+    is_known = all(row["seed"] != SPREAD_SEED for row in known)
+    return {"behaviours": counts, "shared_behaviours": shared if is_known else None}
 
 
 def _layout_rows(

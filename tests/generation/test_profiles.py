@@ -212,6 +212,13 @@ def test_profile_overrides_settings_of_its_base(tmp_path):
     assert mine.search == replace(base.search, episodes=12)
     assert mine.scripted_config("asymm_both_plain", "search") == replace(base.search, episodes=12, histories=3)
     assert mine.units() == base.units()
+    path.write_text('base = "noise"\n[tasks.sampled]\nper_layout = { demo_wide = 2 }\n')
+    sampled = load_profile(str(path)).sampled
+    assert sampled is not None
+    counts = sampled.per_layout
+    assert {name for name, count in counts.items() if count} == {"demo_wide"}, (
+        "a table replaces a number for all layouts"
+    )
     path.write_text('base = "serach"\n')
     with pytest.raises(OptionError, match=r"mine.toml: unknown base 'serach'.*Did you mean 'search'"):
         load_profile(str(path))

@@ -139,7 +139,8 @@ def _read_content(path: Path) -> dict[str, Any]:
 
 def _merge_tables(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
     """Merge nested tables; values of `own` replace values of `base`."""
-    both = {key: _merge_tables(base[key], own[key]) for key in base.keys() & own.keys() if isinstance(own[key], dict)}
+    tables = [key for key in base.keys() & own.keys() if isinstance(base[key], dict) and isinstance(own[key], dict)]
+    both = {key: _merge_tables(base[key], own[key]) for key in tables}
     return {**base, **own, **both}
 
 

@@ -282,12 +282,13 @@ class TestVerifyCommand:
         assert {finding["file"] for finding in content["findings"]} == {SHARD}
 
 
-def test_verify_finds_a_teammate_in_both_training_and_test(tmp_path):
+@pytest.mark.parametrize("split", ["test", "validation"])
+def test_verify_finds_a_training_teammate_in_another_split(tmp_path, split):
     (train,) = make_tasks(["coord_simple"])
-    tasks = [train, make_task("teammate", "test", "coord_simple", train.teammate, 9)]
+    tasks = [train, make_task("teammate", split, "coord_simple", train.teammate, 9)]
     arrays = random_history(train.layout, 6, 20, np.random.default_rng(0))
     new = [NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)]) for task in tasks]
     write_release(tmp_path / "r", "lite", new, data_version="0.0.1", kept_steps=20)
     assert problems(tmp_path / "r") == [
-        f"meta/tasks.jsonl: task {tasks[1].task_id!r} (test) has the teammate of {train.task_id!r} (train)"
+        f"meta/tasks.jsonl: task {tasks[1].task_id!r} ({split}) has the teammate of {train.task_id!r} (train)"
     ]
