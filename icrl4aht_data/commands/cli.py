@@ -1,7 +1,7 @@
 """Entry point of `icrl4aht-data`: imports a command only when it runs, and converts errors to exit codes.
 
 Exit codes: 0 success; 1 an error, a problem found, or a closed output pipe; 2 wrong usage; 128 plus the signal's number
-after a signal stopped a run, whose progress was saved.
+if a signal stopped a run, after its progress was saved.
 """
 
 from __future__ import annotations

@@ -190,7 +190,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ),
     (
         "README",
-        "trained with one teammate earned {}, perhaps",
+        "Best responses earned {}, maybe",
         lambda: gains_of_best_responses()["demo_wide"] + adaptation_on_demo_wide()[1],
     ),
     (

@@ -268,7 +268,7 @@ def submit_command(
     check_output(out, overwrite)
     found = submission.make_submission(folders, submission.AgentFacts(**facts), name, update)
     stored = stored_results.read_stored(stored_results.results_file())
-    stored_results.check_agent(stored, found, ", ".join(map(str, folders)))
+    stored_results.add_submission(stored, found, ", ".join(map(str, folders)))  # raises errors
     submission.write_submission(out, found)
     click.echo(f"wrote {out}: {found.agent}, {' and '.join(found.tracks)}; `icrl4aht-data results {out}` shows it")
 
@@ -298,8 +298,7 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
     stored = stored_results.read_stored(stored_results.results_file())
     for path in files:
         found = read_submission(path)
-        stored_results.check_agent(stored, found, str(path))
-        stored = stored_results.add_submission(stored, found)
+        stored = stored_results.add_submission(stored, found, str(path))
     if store:
         stored_results.write_stored(stored_results.results_file(), stored)
     for path in comparison.write_comparison(stored, out):

@@ -1,4 +1,4 @@
-"""The page docs/results.md, which compares agents whose results are stored."""
+"""Write the page docs/results.md, which compares the stored results of agents."""
 
 from __future__ import annotations
 
@@ -317,13 +317,19 @@ def describe_training_runs() -> str:
     if not trained:
         return ""
     steps = _format_range([one.steps for one in trained], ",d")
-    width, started = _format_range([one.width for one in trained], "d"), sum(bool(one.init) for one in trained)
+    width, tuned = _format_range([one.width for one in trained], "d"), [one.seed for one in trained if one.init]
+    started = (
+        f" {len(tuned)} runs, with seed {_format_range(tuned, 'd')}, started from a bundled model; its own training is "
+        "not counted."
+        if tuned
+        else ""
+    )
     models = sum(not one.agent.startswith("best response") for one in behaviours)
     runs = _format_range([len(one.seeds) for one in behaviours], "d")
     return (
         f"Each of {len(behaviours)} behaviours of published test teammates has {runs} training "
-        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}. {started} runs of one seed fine-tuned"
-        f" a bundled model, whose own training is not counted. For {models} behaviours a stored model earned more."
+        f"{'run' if runs == '1' else 'runs'} of {steps} steps with width {width}.{started} For {models} behaviours a "
+        "stored model earned more."
     )
 
 

@@ -105,13 +105,8 @@ def write_stored(path: Path, stored: StoredResults) -> None:
         write_json(partial, msgspec.to_builtins(stored.agents))
 
 
-def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
-    """Check that a submission fits the stored results.
-
-    Raises:
-        OptionError: if `Submission.update` is set for an agent that is not stored, or not set for a stored agent, or if
-            the agent would have different training runs on the layouts of the published tracks.
-    """
+def _check_update(stored: StoredResults, found: Submission, where: str) -> None:
+    """Check that `Submission.update` is set if the submission's agent is already stored, and only then."""
     known = {agent.casefold(): agent for agent in stored.agents}.get(found.agent.casefold())
     if known and not found.update:
         raise OptionError(
@@ -120,25 +115,39 @@ def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
         )
     if found.update and found.agent != known:
         raise OptionError(f"{where}: updates the agent {found.agent}, which is not on the page; leave out --update")
-    table = add_submission(stored, found).table
-    own = table[(table["agent"] == found.agent) & (table["protocol"] == SUBMITTED_PROTOCOL)]
+
+
+def _check_training_runs(table: pd.DataFrame, agent: str, where: str) -> None:
+    """Check that an agent has the same training runs on all layouts of a kind, and controls of these runs only."""
+    own = table[(table["agent"] == agent) & (table["protocol"] == SUBMITTED_PROTOCOL)]
     runs = {key: {*of["training"]} for key, of in own.groupby(["kind", "control", "layout"])}
-    first = {key[:2]: trainings for key, trainings in reversed(runs.items())}
+    first: dict[tuple[str, str], set[int]] = {}
     for (kind, control, layout), trainings in runs.items():
-        elsewhere, main = first[kind, control], runs.get((kind, "", layout), trainings)
+        elsewhere = first.setdefault((kind, control), trainings)
+        main = runs.get((kind, "", layout), trainings)
         if trainings != elsewhere or not trainings <= main:
             expected = elsewhere if trainings != elsewhere else main
             raise OptionError(
-                f"{where}: with the stored results, {found.agent} would have training runs {sorted(trainings)} on "
+                f"{where}: with the stored results, {agent} would have training runs {sorted(trainings)} on "
                 f"{layout}, but {sorted(expected)} in its other results; give results of the same runs"
             )
 
 
-def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
+def add_submission(stored: StoredResults, found: Submission, where: str = "submission") -> StoredResults:
     """Return stored results plus submitted ones.
 
     If `Submission.update` is set, they replace the agent's stored results on the same layouts.
+
+    Args:
+        stored: stored results.
+        found: submitted results.
+        where: name of the submission in messages.
+
+    Raises:
+        OptionError: if `Submission.update` is set for an agent that is not stored, or not set for a stored agent, or if
+            the agent would have different training runs on the layouts of a kind of tasks.
     """
+    _check_update(stored, found, where)
     controls = {one.control for one in found.evaluations}
     tables, curves, tasks = [], defaultdict(list), [*bundled_tasks_by_id("test", tuple(found.tracks)).values()]
     for one in found.evaluations:
@@ -158,9 +167,11 @@ def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
         is_replaced &= old["layout"].isin(new["layout"].unique())
         return pd.concat([part for part in (old[~is_replaced], new) if len(part)], ignore_index=True)
 
+    table = replace_rows(stored.table, pd.concat(tables, ignore_index=True))
+    _check_training_runs(table, found.agent, where)
     facts = found.facts if "" in controls else stored.agents[found.agent]
     return StoredResults(
-        replace_rows(stored.table, pd.concat(tables, ignore_index=True)),
+        table,
         replace_rows(stored.curves, pd.DataFrame(rows, columns=CURVE_COLUMNS)),
         stored.agents | {found.agent: facts},
     )

@@ -205,7 +205,7 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
 def unusable_families(layouts: Iterable[str]) -> list[LeftOutTask]:
     """Return heuristic families without usable sampled training teammates, with the reasons, for each layout."""
     return [
-        LeftOutTask("", layout, HEURISTIC_KINDS[family], "", 0, 0, None, None, unusable_reason(layout, family))
+        _left_out(layout, HEURISTIC_KINDS[family], unusable_reason(layout, family))
         for layout in layouts
         if layout in TESTED_ON
         for family in HEURISTIC_FAMILIES
@@ -219,21 +219,20 @@ def few_spread_teammates(per_layout: Mapping[str, int]) -> list[LeftOutTask]:
     Args:
         per_layout: number of spread training teammates in a release, by layout, see `teammates.spread`.
     """
-    most = max(per_layout.values())
+    most = max(per_layout.values(), default=0)
     spreads = (read_spread(layout) for layout in TESTED_ON if per_layout.get(layout, most) < most)
     return [
-        LeftOutTask(
-            "",
+        _left_out(
             spread.layout,
             "spread",
-            "",
-            0,
-            0,
-            None,
-            None,
             f"{spread.unlike_tests} of {spread.tried} candidates act unlike test teammates, {spread.headroom} of these "
             "have headroom",
         )
         for spread in spreads
         if spread.headroom
     ]
+
+
+def _left_out(layout: str, teammate: str, reason: str) -> LeftOutTask:
+    """Return an entry for teammates of a layout for which no task was planned."""
+    return LeftOutTask("", layout, teammate, "", 0, 0, None, None, reason)

@@ -215,6 +215,6 @@ def test_results_with_sampled_actions_are_added_to_an_agent(tmp_path):
     with pytest.raises(
         OptionError, match=r"mine.json: .* would have training runs \[0, 1\] on coord_ring, but \[0\] in its"
     ):
-        stored_results.check_agent(later, make_submission(two, FACTS, update=True), "mine.json")
+        stored_results.add_submission(later, make_submission(two, FACTS, update=True), "mine.json")
     replaced = stored_results.add_submission(later, make_submission([own], FACTS, update=True))
     assert set(replaced.table["control"]) == {""}

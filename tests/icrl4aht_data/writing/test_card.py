@@ -138,7 +138,7 @@ def test_card_of_human_histories_says_only_what_is_true_of_them(write_meta):
     rai, card = rai_texts(content), render_card(content)
     assert rai["data_collection"].startswith("People play a simulated game with programs")
     assert rai["data_preprocessing_protocol"] == "Histories of human have all finished episodes."
-    assert rai["data_annotation_protocol"] == "There are no labels."
+    assert rai["data_annotation_protocol"] == "There are no labels. Nobody annotated anything by hand."
     assert "The people are volunteers" in rai["data_biases"] and "unequal" not in rai["data_biases"]
     assert "Teammates are scripts, not people." in rai["data_biases"]
     assert "Pseudonyms" in rai["personal_sensitive_information"]
