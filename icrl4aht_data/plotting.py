@@ -233,7 +233,7 @@ def _mean_by_episode(histories: Sequence[np.ndarray]) -> tuple[np.ndarray, np.nd
 
 
 def average_in_blocks(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Average returns over blocks of episodes that are equally long on a logarithmic axis.
+    """Average returns over episode blocks of equal width on a logarithmic axis.
 
     Args:
         returns: returns by episode, float64 (N, E).

@@ -139,7 +139,7 @@ class ProofJob(TrainingJob):
     @property
     def first(self) -> int:
         """Number of episodes to train on at the start of each history; 0 for all episodes."""
-        return _FIRST_EPISODES if self.source == "search" else 0  # other sources improve over all their episodes
+        return _FIRST_EPISODES if self.source == "search" else 0  # other histories improve to the last episode
 
     @property
     def settings(self) -> dict[str, Any]:

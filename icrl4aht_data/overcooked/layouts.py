@@ -378,7 +378,7 @@ def _manifest_layouts() -> dict[str, Layout]:
 
 @lru_cache(maxsize=1024)
 def with_recipes(layout: Layout, recipes: tuple[tuple[int, int, int], ...]) -> Layout:
-    """Return a copy of a layout with other recipes; equal arguments give the same object.
+    """Return a copy of a layout with other recipes, cached by the arguments.
 
     Raises:
         OptionError: if there is no recipe, two recipes are equal, or an ingredient has no pile.

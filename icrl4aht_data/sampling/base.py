@@ -50,7 +50,7 @@ class SamplerOptions(TypedDict, total=False):
 class Sampler(Generic[B, D, T]):
     """A sequence of batches, each a pure function of its number; see `ADSampler` and `DPTSampler` for the options.
 
-    `len(sampler)` batches have as many steps as the selection; larger batch numbers are valid too.
+    `len(sampler)` batches have about as many steps as the selection; larger numbers are valid too.
 
     Attributes:
         dataset: the selection.

@@ -57,10 +57,10 @@ class NoiseConfig:
                 raise OptionError(f"{name} = {[low, high]}: expected a range [low, high]")
         if self.begin[1] > self.finish[0]:
             raise OptionError(
-                f"begin = {list(self.begin)}: expected at most the values of finish = {list(self.finish)}"
+                f"begin = {list(self.begin)}: expected no value above finish = {list(self.finish)}"
             )
         if self.start[0] < self.end[1]:
-            raise OptionError(f"start = {list(self.start)}: expected at least the values of end = {list(self.end)}")
+            raise OptionError(f"start = {list(self.start)}: expected no value below end = {list(self.end)}")
 
 
 SEARCH = NoiseConfig(start=(0.0, 0.2), begin=(1.0, 1.0))
