@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import lzma
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -121,7 +121,7 @@ def _check_training_runs(table: pd.DataFrame, agent: str, where: str) -> None:
     """Check that an agent has the same training runs on all layouts of a kind, and controls of these runs only."""
     own = table[(table["agent"] == agent) & (table["protocol"] == SUBMITTED_PROTOCOL)]
     runs = {key: {*of["training"]} for key, of in own.groupby(["kind", "control", "layout"])}
-    first: dict[tuple[str, str], set[int]] = {}
+    first: dict[tuple[Hashable, Hashable], set[int]] = {}
     for (kind, control, layout), trainings in runs.items():
         elsewhere = first.setdefault((kind, control), trainings)
         main = runs.get((kind, "", layout), trainings)

@@ -56,9 +56,7 @@ class NoiseConfig:
             if low > high:
                 raise OptionError(f"{name} = {[low, high]}: expected a range [low, high]")
         if self.begin[1] > self.finish[0]:
-            raise OptionError(
-                f"begin = {list(self.begin)}: expected no value above finish = {list(self.finish)}"
-            )
+            raise OptionError(f"begin = {list(self.begin)}: expected no value above finish = {list(self.finish)}")
         if self.start[0] < self.end[1]:
             raise OptionError(f"start = {list(self.start)}: expected no value below end = {list(self.end)}")
 
