@@ -57,7 +57,7 @@ def noise_schedules(config: NoiseConfig, seed: int) -> np.ndarray:
     start, end, begin, finish, power = (low + (high - low) * drawn[:, k] for k, (low, high) in enumerate(ranges))
     share = np.linspace(0, 1, config.episodes)
     length = finish - begin
-    fallen = np.where(length > 0, (share - begin) / np.where(length > 0, length, 1), share >= finish).clip(0, 1)
+    fallen = np.where(length > 0, (share - begin) / np.where(length > 0, length, 1), share > finish).clip(0, 1)
     # Rounding removes the last bits of a power, which differ between platforms.
     return np.round(end + (start - end) * (1 - fallen) ** power, 6).astype(np.float32)
 

@@ -62,5 +62,5 @@ class NoiseConfig:
 
 
 SEARCH = NoiseConfig(start=(0.0, 0.2), begin=(1.0, 1.0))
-"""Default of the source `search`: each history has a constant chance of a random action, except in its last episode;
-so the number of an episode does not reveal how well the ego plays."""
+"""Default of the source `search`: each history has a constant chance of a random action, so the number of an episode
+does not reveal how well the ego plays."""
