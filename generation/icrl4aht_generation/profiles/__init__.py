@@ -157,7 +157,7 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
     release, tasks = content.release, content.tasks
     check_version(release.data_version)
     layouts, sources = _layout_names("tasks.layouts", tasks.layouts), _check_distinct("tasks.sources", tasks.sources)
-    generated: dict[str, int] = {}
+    named, generated = layouts, dict[str, int]()
     for one in tasks.generated:
         found = add_layouts(generate_layouts(one.family, one.seed, one.count, split=one.split))
         names = _check_distinct("tasks.generated", [*generated, *(layout.name for layout in found)])
@@ -195,10 +195,8 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
         sources=sources,
         learners=tasks.learners,
         presets=_check_distinct("tasks.presets", tasks.presets),
-        sampled=_sampled_config(tasks.sampled, layouts, sources) if tasks.sampled else None,
-        spread=SpreadConfig(**_teammate_counts("tasks.spread", tasks.spread, layouts, sources))
-        if tasks.spread
-        else None,
+        sampled=_sampled_config(tasks.sampled, named, sources) if tasks.sampled else None,
+        spread=SpreadConfig(**_teammate_counts("tasks.spread", tasks.spread, named, sources)) if tasks.spread else None,
         algorithms={each: tuple(algorithms[each]) for each in layouts if algorithms.get(each)},
         xla_threads=content.xla_threads,
         **msgspec.structs.asdict(release),
@@ -228,7 +226,11 @@ def _sampled_config(values: _SampledTasks, layouts: tuple[str, ...], sources: tu
 def _teammate_counts(
     section: str, values: _Spread, layouts: tuple[str, ...], sources: tuple[str, ...]
 ) -> dict[str, dict[str, int]]:
-    """Return the requested numbers of teammates by field of `SpreadConfig` and by layout."""
+    """Return the requested numbers of teammates by field of `SpreadConfig` and by layout of `tasks.layouts`."""
+    if not layouts:
+        raise OptionError(
+            f"{section}: expected layouts in tasks.layouts; teammates of generated layouts are set in tasks.generated"
+        )
     given = {"per_layout": values.per_layout, "validation": values.validation}
     given["ppo"] = values.per_layout if values.ppo is None else values.ppo
     tables: dict[str, Any] = {key: _by_layout(f"{section}.{key}", value, layouts) for key, value in given.items()}
