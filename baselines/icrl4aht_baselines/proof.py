@@ -96,7 +96,7 @@ class ProofOptions:
 
     root: str | None = None
     steps: int = 4000
-    batch_size: int = 16
+    batch_size: int = 8
     context: int = 500
     tasks: dict[str, tuple[Task, ...]] = field(default_factory=proof_tasks)
 

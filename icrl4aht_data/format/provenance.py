@@ -235,10 +235,10 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
             return_end: mean return of the last episodes of the task's histories, see `schema.curve_ends`.
 
         Returns:
-            Whether the oracle earns at least `return_end`. Also True if the oracle's return is unknown, or if teammates
-            change (the known return is with the task's teammate).
+            Whether the oracle earns at least `return_end`. Also True if the oracle's return is unknown, if teammates
+            change (the known return is with the task's teammate), or for source `noise` (the expert is the oracle).
         """
-        if self.references is None or self.swaps is not None:
+        if self.references is None or self.swaps is not None or self.source == "noise":
             return True
         return self.references.oracle >= return_end
 

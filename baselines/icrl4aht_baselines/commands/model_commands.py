@@ -63,6 +63,12 @@ from icrl4aht_data.utils.text import counted_noun
     help="Change the teammate after every N episodes to another one of its kind, layout and split, unannounced.",
     show_default="never",
 )
+@click.option(
+    "--number",
+    type=click.IntRange(0, 99),
+    default=0,
+    help="Number of the collection. Releases with different numbers have different tasks, so they can be combined.",
+)
 @shared.manifests_option
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
 @overwrite_option
@@ -77,6 +83,7 @@ def collect_command(
     noise: tuple[float, float],
     labeller: str | None,
     swap: int | None,
+    number: int,
     manifests: tuple[Path, ...],
     out: Path,
     overwrite: bool,
@@ -101,7 +108,7 @@ def collect_command(
     names = [get_layout(name).name for name in layouts] or None
     dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
     tasks = [task for manifest in manifests for task in read_tasks_and_layouts(manifest)]
-    teammates = release_teammates(dataset, tasks=tasks)
+    teammates = release_teammates(dataset, number, tasks)
     if swap is not None and (alone := len(teammates.tasks) - len(plan_swaps(teammates.tasks, config.episodes, swap))):
         click.echo(f"{counted_noun(alone, 'task')} without another teammate of its kind, split and layout: not swapped")
     with progress_bars(unit="episodes") as show:

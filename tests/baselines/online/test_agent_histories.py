@@ -22,6 +22,7 @@ from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.errors import LabelsMissingError, OptionError
 from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.overcooked.actions import STAY
+from icrl4aht_data.writing.combine import combine_releases
 from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import TEST_TASKS
 
@@ -199,3 +200,7 @@ def test_collect_command_writes_a_release_and_refuses_to_overwrite(tmp_path):
     assert "describes it" in printed
     with pytest.raises(OptionError, match="--overwrite"):
         run_cli(*arguments)
+    run_cli(*arguments[:-1], str(tmp_path / "second"), "--number", "1")
+    combined = load_icrl4aht(combine_releases(tmp_path / "both", [tmp_path / "release", tmp_path / "second"]))
+    one, two = (set(combined.select(numbers).column("task_id")) for numbers in np.array_split(combined.ids, 2))
+    assert len(one) == len(two) and not one & two
