@@ -173,29 +173,41 @@ def _training_seconds(timing: Path) -> float:
     return float(np.sum(steps / [line["steps_per_second"] for line in lines]))
 
 
-def evaluate_on_sets(
-    agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = True
-) -> dict[str, dict[str, float]]:
+def evaluate_on_sets(agent: NamedEgo, options: ProofOptions, out: Path) -> dict[str, dict[str, float]]:
     """Evaluate an agent on each set of validation tasks.
+
+    On the track `preference` it also plays with its memory cleared before each episode.
 
     Args:
         agent: agent to evaluate.
         options: settings with the sets of tasks.
         out: folder of the results.
-        controls: whether the agent also plays with its memory cleared before each episode.
 
     Returns:
         Name of the set, followed by " cleared" for cleared memory -> block of episodes -> mean return.
     """
     found = {}
-    for control in (None, "cleared")[: 1 + controls]:
-        for name, tasks in options.tasks.items():
+    for name, tasks in options.tasks.items():
+        for control in (None, "cleared") if name == PREFERENCE else (None,):
             folder = out / f"{name}{' cleared' if control else ''}"
-            shared: Any = {"seeds": _SEEDS[name], "control": control, "show": lambda *shown: None}
-            run = evaluate_agent(agent, tasks, PROOF_PROTOCOL, folder, **shared)
-            means = run.table.groupby("block")["return"].mean()
-            found[folder.name] = {str(block): round(float(mean), 3) for block, mean in means.items()}
+            hidden: Any = {"show": lambda *shown: None}
+            found[folder.name] = _mean_returns(agent, name, tasks, folder, control=control, **hidden)
     return found
+
+
+def _mean_returns(agent: NamedEgo, name: str, tasks: Sequence[Task], folder: Path, **options: Any) -> dict[str, float]:
+    """Return block of episodes -> mean return of an agent on a set of validation tasks.
+
+    Args:
+        agent: agent to evaluate.
+        name: name of the set.
+        tasks: tasks of the set.
+        folder: folder of the results.
+        options: further arguments for `evaluate_agent`.
+    """
+    run = evaluate_agent(agent, tasks, PROOF_PROTOCOL, folder, seeds=_SEEDS[name], **options)
+    means = run.table.groupby("block")["return"].mean()
+    return {str(block): round(float(mean), 3) for block, mean in means.items()}
 
 
 def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[str, float]]], path: Path) -> Path:
@@ -203,11 +215,11 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
 
     Args:
         jobs: training jobs; unfinished jobs are skipped.
-        references: name of an ego -> returns from `evaluate_on_sets`.
+        references: returns from `run_references`.
         path: path of the file. Models in an earlier file that were trained and evaluated with the same settings, but on
             other histories or with other labels, are kept.
     """
-    stay, expert = (references[name][TEAMMATE_TRACK]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
+    stay, expert = (references[TEAMMATE_TRACK][name]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
     finished, models = [job for job in jobs if job.is_finished()], []
     options, dataset = jobs[0].options, load_icrl4aht(jobs[0].options.root)
     for (source, learner), own in grouped(finished, lambda job: (job.source, job.learner)).items():
@@ -228,7 +240,7 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
         "data_version": dataset.info.data_version,
         "training": {"steps": options.steps, "batch_size": options.batch_size, "context": options.context},
         "tasks": {name: len(tasks) for name, tasks in options.tasks.items()},
-        "references": {name: references[name][PREFERENCE] for name in COMPARED_EGOS[PREFERENCE]},
+        "references": references[PREFERENCE],
         "models": models,
     }
     before = parse_json(read_text(path)) if path.is_file() else {}
@@ -241,8 +253,13 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
 
 
 def run_references(options: ProofOptions, out: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Return the returns from `evaluate_on_sets` of each ego in `COMPARED_EGOS`, by name; stored results are reused."""
-    names = dict.fromkeys(name for of_set in COMPARED_EGOS.values() for name in of_set)
-    return {
-        name: evaluate_on_sets(find_agent(name), options, out / "references" / name, controls=False) for name in names
-    }
+    """Return set of tasks -> name of an ego in `COMPARED_EGOS` -> block of episodes -> mean return.
+
+    Stored results are reused.
+    """
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for of_set, names in COMPARED_EGOS.items():
+        for name in names:
+            folder = out / "references" / name / of_set
+            found.setdefault(of_set, {})[name] = _mean_returns(find_agent(name), of_set, options.tasks[of_set], folder)
+    return found

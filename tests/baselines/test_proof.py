@@ -49,9 +49,10 @@ def test_proof_table_has_mean_and_range_over_finished_training_runs(release, tmp
         job.folder.mkdir()
         job.result_file.write_text(json.dumps(content_of(job, late)))
     assert [job.is_finished() for job in jobs] == [True, True, False]
+    blocks = {"1": 0.0, "6-20": 40.0}
     earned = {
-        name: block_returns(0.0, 40.0, 0.0, value)
-        for name, value in (("stay", 0), ("search", 30), ("rl2-reference", 20))
+        "preference": {"stay": blocks, "search": blocks},
+        "teammate": {"stay": {"all": 0.0}, "rl2-reference": {"all": 20.0}},
     }
     path = write_proof(jobs, earned, tmp_path / "proof.json")
     content = json.loads(path.read_text())
@@ -107,11 +108,11 @@ def test_proof_job_trains_and_evaluates_a_model_with_and_without_memory(release,
     job.run(lambda done, speed: steps.append(done))
     assert steps == [1, 2] and job.is_finished()
     found = job.result()["returns"]
-    assert {*found} == {"preference", "preference cleared", "teammate", "teammate cleared"}
+    assert {*found} == {"preference", "preference cleared", "teammate"}
     assert {"1", "2-5", "6-20", "all"} <= found["preference"].keys()
     assert job.finished_text().startswith("first episode ")
     before = job.result_file.stat().st_mtime_ns
     job.run()
     assert job.result_file.stat().st_mtime_ns == before
-    stay = run_references(options, tmp_path)["stay"]["preference"]
+    stay = run_references(options, tmp_path)["preference"]["stay"]
     assert stay["1"] == stay["6-20"]  # an ego that never moves earns the same in all episodes
