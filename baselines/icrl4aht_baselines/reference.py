@@ -92,7 +92,7 @@ TRACK_PLAY: dict[str, dict[str, Any]] = {
 
 
 @dataclass(frozen=True)
-class Recipe:
+class ReferenceSettings:
     """Settings that a reference model is made with.
 
     Attributes:
@@ -137,11 +137,11 @@ _STEPS: dict[str, Any] = {"steps": 4000, "batch_size": 16, "context": 200, "lear
 _QUERIES: dict[str, Any] = {"labels": "expert", "queries": _STEPS["context"] + 1}
 _ADAPTING: dict[str, Any] = {"steps": 320, "batch_size": 384, "log_every": 5, "save_every": 20}
 
-RECIPES = {
-    "rl2-reference": Recipe(
+REFERENCE_SETTINGS = {
+    "rl2-reference": ReferenceSettings(
         "rl2", True, RL2_SETTINGS["model"], {**RL2_SETTINGS["train"], "steps": 1600}, role="plays best"
     ),
-    "rl2-adapting": Recipe(
+    "rl2-adapting": ReferenceSettings(
         "rl2",
         True,
         RL2_SETTINGS["model"],
@@ -152,10 +152,10 @@ RECIPES = {
         one_model=True,
         role="adapts best",
     ),
-    "ad-reference": Recipe(
+    "ad-reference": ReferenceSettings(
         "ad", False, _TINY, _STEPS, {"labels": "expert"}, own_round=True, greedy=True, role="best of AD"
     ),
-    "dpt-reference": Recipe(
+    "dpt-reference": ReferenceSettings(
         "dpt", False, _TINY, {**_STEPS, "steps": 2000}, _QUERIES, own_round=True, role="best of DPT"
     ),
 }
@@ -168,8 +168,8 @@ def check_learns_from_teacher(name: str) -> None:
     Raises:
         OptionError: if the model learns by playing.
     """
-    if RECIPES[name].plays:
-        taught = ", ".join(each for each, recipe in RECIPES.items() if not recipe.plays)
+    if REFERENCE_SETTINGS[name].plays:
+        taught = ", ".join(each for each, reference in REFERENCE_SETTINGS.items() if not reference.plays)
         raise OptionError(
             f"{name} does not learn from a teacher's histories; leave out --teacher, or choose another --name: {taught}"
         )
@@ -180,7 +180,7 @@ class ReferenceJob(TrainingJob):
     """Job that trains a reference model for a track. Existing releases are reused.
 
     Attributes:
-        model: name in `RECIPES`.
+        model: name in `REFERENCE_SETTINGS`.
         track: name of the track, or `EVERY_TRACK`.
         seed: seed of the training runs.
         out: folder of all jobs, with the content that the top of this module describes.
@@ -207,25 +207,25 @@ class ReferenceJob(TrainingJob):
         return f"{self.model}, {format_track(self.track)}, seed {self.seed}"
 
     @property
-    def recipe(self) -> Recipe:
+    def reference(self) -> ReferenceSettings:
         """Settings that the model is made with."""
-        return RECIPES[self.model]
+        return REFERENCE_SETTINGS[self.model]
 
     @property
     def training(self) -> TrainOptions:
         """Settings of a training run, for the trainer."""
-        return TrainOptions(**self.recipe.train, seed=self.seed)
+        return TrainOptions(**self.reference.train, seed=self.seed)
 
     @property
     def updates(self) -> int:
         """Number of training steps, summed over both training runs if there are two."""
-        return self.training.steps * (1 + self.recipe.own_round)
+        return self.training.steps * (1 + self.reference.own_round)
 
     @property
     def steps_per_update(self) -> int:
         """Number of environment steps, or steps of histories, in a training step; approximate if the model plays."""
-        played = PlayOptions(**self.recipe.play).episodes * KEPT_STEPS
-        return self.training.batch_size * (played if self.recipe.plays else self.training.context)
+        played = PlayOptions(**self.reference.play).episodes * KEPT_STEPS
+        return self.training.batch_size * (played if self.reference.plays else self.training.context)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -233,7 +233,7 @@ class ReferenceJob(TrainingJob):
         views, play = TRACK_VIEWS[self.track], TRACK_PLAY[self.track]
         data = {"teacher": self.teacher, "noise": (RL2_HISTORIES, OWN_HISTORIES)}
         code = {"code_version": version("icrl4aht-data")}
-        return to_builtins({"recipe": self.recipe, "views": views, "play": play, **data, **code})
+        return to_builtins({"reference": self.reference, "views": views, "play": play, **data, **code})
 
     def runs(self) -> list[tuple[Path, int]]:
         """Return the folders of the training runs, last run first, with the number of earlier training steps."""
@@ -241,11 +241,11 @@ class ReferenceJob(TrainingJob):
 
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
         """Make the training data and train the model. Return no measured values."""
-        if self.recipe.plays:
+        if self.reference.plays:
             self.train_by_playing(on_update)
             return {}
         histories, first = self.teacher_histories(), None
-        if self.recipe.own_round:
+        if self.reference.own_round:
             first = self.folder / "first"
             self.train(histories, first, on_update)
             histories = self.add_own_histories(histories, first)
@@ -280,13 +280,15 @@ class ReferenceJob(TrainingJob):
 
     def train_by_playing(self, on_update: OnUpdate) -> None:
         """Train RL^2 by playing with the teammates of a release and of `diverse_tasks`."""
-        recipe, root = self.recipe, str(self.generated_release(self.recipe.profile))
-        layouts = (ALL_LAYOUTS,) if recipe.one_model else TRACKS[self.track]["train"]
+        reference, root = self.reference, str(self.generated_release(self.reference.profile))
+        layouts = (ALL_LAYOUTS,) if reference.one_model else TRACKS[self.track]["train"]
         choice = HistoryOptions(layouts, root, **TRACK_VIEWS[self.track])
-        model, play = ModelOptions(**recipe.model), PlayOptions(**TRACK_PLAY[self.track], **recipe.play)
-        job = prepare_play(recipe.method, model, self.training, play, choice, self.diverse_tasks())
+        model, play = ModelOptions(**reference.model), PlayOptions(**TRACK_PLAY[self.track], **reference.play)
+        job = prepare_play(reference.method, model, self.training, play, choice, self.diverse_tasks())
         params = (
-            load_initial_params(MODELS / recipe.start / "teammate", job.method, job.about) if recipe.start else None
+            load_initial_params(MODELS / reference.start / "teammate", job.method, job.about)
+            if reference.start
+            else None
         )
         job.train(self.run_folder, params=params, done=self.step_progress(on_update))
 
@@ -313,9 +315,9 @@ class ReferenceJob(TrainingJob):
         options = self.training
         if before:
             options = replace(options, learning_rate=OWN_SHARE * options.learning_rate)
-        views = {**self.recipe.histories, **TRACK_VIEWS[self.track]}
+        views = {**self.reference.histories, **TRACK_VIEWS[self.track]}
         histories = HistoryOptions(TRACKS[self.track]["train"], str(root), channels="canonical", **views)
-        job = prepare(self.recipe.method, ModelOptions(**self.recipe.model), options, histories)
+        job = prepare(self.reference.method, ModelOptions(**self.reference.model), options, histories)
         params = load_initial_params(before, job.method, job.about) if before else None
         job.train(folder, params=params, done=self.step_progress(on_update, options.steps if before else 0))
 
@@ -341,7 +343,7 @@ class ReferenceJob(TrainingJob):
 
     def evaluate(self, show: Callable[..., None]) -> None:
         """Evaluate the trained model, with the function `show` for progress."""
-        agent = find_agent(self.run_folder, greedy=self.recipe.greedy)._replace(name=self.model)
+        agent = find_agent(self.run_folder, greedy=self.reference.greedy)._replace(name=self.model)
         for kind, (split, protocol, seeds) in EVALUATIONS.items():
             shown: Any = {"seeds": range(seeds), "show": show, "what": f"{self.name}, {kind}"}
             evaluate_agent(agent, self.evaluation_tasks(split), get_protocol(protocol), self.results(kind), **shown)

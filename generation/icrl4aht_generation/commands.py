@@ -33,6 +33,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import plot_layouts, save_figure
 from icrl4aht_data.utils.files import atomic_write, check_output
 from icrl4aht_data.utils.progress import bar_updater, progress_bars
+from icrl4aht_data.utils.text import card_file
 from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS, generate_layouts, split_of
 from icrl4aht_generation.learners.config import EncoderKind
@@ -392,12 +393,28 @@ def teammates(
 @_algorithms_option
 @_suite_option
 @click.option("--greedy", is_flag=True, help="Let the teammate act greedily, as in the dataset.")
-def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
-    """Report how much the teammates of a suite differ.
+@click.option(
+    "--release",
+    type=Folder(),
+    metavar="FOLDER",
+    help="Compare the validation teammates of this release with its training teammates instead.",
+)
+@click.option("--bundle", is_flag=True, help="With --release, also write the distances to the package's cards.")
+def diversity(
+    layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool, release: Path | None, bundle: bool
+) -> None:
+    """Report how much the teammates of a suite or of a release differ.
 
     Prints self-play and cross-play returns of each population, and mean Hamming distances (share of states in which two
-    teammates act differently) between algorithms and families of heuristics. Writes nothing.
+    teammates act differently) between algorithms and families of heuristics. With --release, prints for each training
+    layout the smallest distance of a validation teammate to a training teammate.
     """
-    from icrl4aht_generation.populations.build import report_diversity
+    from icrl4aht_data.writing.splits import DISTANCES_FILE
+    from icrl4aht_generation.populations.build import report_diversity, report_splits
 
-    report_diversity(suite, layouts, algorithms, greedy, console)
+    if bundle and not release:
+        raise OptionError("--bundle: expected --release as well, whose distances are written")
+    if release:
+        report_splits(release, card_file(DISTANCES_FILE) if bundle else None, console)
+    else:
+        report_diversity(suite, layouts, algorithms, greedy, console)

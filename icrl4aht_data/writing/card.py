@@ -58,6 +58,7 @@ from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.install_hints import project_url
 from icrl4aht_data.utils.text import card_file, counted_noun, markdown_table
 from icrl4aht_data.writing.proof import proof_table, read_proof
+from icrl4aht_data.writing.splits import played_teammates, read_distances
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -218,6 +219,7 @@ def card_facts(root: Path) -> dict[str, Any]:
         "teammates": teammates,
         "teammate_kinds": _kind_rows(tasks, info.layouts),
         **_behaviour_counts(teammates),
+        "split_distances": read_distances(played_teammates(by_id.values(), provenance)),
         "weak": Counter((titles[task.first.layout], task.first.source) for task in tasks if task.has_weak_labels),
         "left_out": [asdict(task) for task in info.left_out],
         "headroom": headroom,

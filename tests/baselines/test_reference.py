@@ -1,4 +1,4 @@
-"""Test reference models: training recipes, the steps that make the models, and resumed commands."""
+"""Test reference models: training settings, the steps that make the models, and resumed commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icrl4aht_baselines.agents import bundled
 from icrl4aht_baselines.agents.bundled import EVERY_TRACK, MODELS, bundled_models
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
-from icrl4aht_baselines.reference import RECIPES, RL2_HISTORIES, ReferenceJob
+from icrl4aht_baselines.reference import REFERENCE_SETTINGS, RL2_HISTORIES, ReferenceJob
 from icrl4aht_baselines.report.results import EvaluationRun
 from icrl4aht_baselines.training import trainer
 from icrl4aht_baselines.training.histories import read_trained
@@ -35,24 +35,24 @@ MODEL = {"layers": 1, "width": 8, "heads": 2, "encoder": "mlp", "teammate_action
 
 
 def test_recipes_match_the_settings_of_the_bundled_models():
-    """Each recipe is valid and equals the settings stored with its bundled model."""
-    for name, recipe in RECIPES.items():
-        get_method(recipe.method)
-        ModelOptions(**recipe.model)
-        TrainOptions(**recipe.train)
-        PlayOptions(**recipe.play)
+    """The settings are valid and equal the settings stored with its bundled model."""
+    for name, settings in REFERENCE_SETTINGS.items():
+        get_method(settings.method)
+        ModelOptions(**settings.model)
+        TrainOptions(**settings.train)
+        PlayOptions(**settings.play)
         for view in reference.TRACK_VIEWS.values():
-            HistoryOptions(("demo_wide",), **recipe.histories, **view)
-        config = read_config(MODELS / name / recipe.tracks[-1])
-        rate = {"learning_rate": reference.OWN_SHARE * recipe.train["learning_rate"]} if recipe.own_round else {}
-        expected = {**recipe.model, **recipe.train, **rate, "method": recipe.method}
+            HistoryOptions(("demo_wide",), **settings.histories, **view)
+        config = read_config(MODELS / name / settings.tracks[-1])
+        rate = {"learning_rate": reference.OWN_SHARE * settings.train["learning_rate"]} if settings.own_round else {}
+        expected = {**settings.model, **settings.train, **rate, "method": settings.method}
         given = {**config["model"], **config["train"], "method": config["method"]}
-        assert recipe.play.items() <= config.get("play", {}).items()
+        assert settings.play.items() <= config.get("play", {}).items()
         assert {key: given[key] for key in expected} == {
             key: list(value) if isinstance(value, tuple) else value for key, value in expected.items()
         }
-        assert bundled_models()[name].sampled is not recipe.greedy
-        assert recipe.histories.items() <= config["histories"].items()
+        assert bundled_models()[name].sampled is not settings.greedy
+        assert settings.histories.items() <= config["histories"].items()
     assert RL2_HISTORIES.end == (0.0, 0.0) and RL2_HISTORIES.finish[1] < 1
 
 
@@ -121,12 +121,12 @@ def test_model_of_all_tracks_is_evaluated_on_all_tracks(tmp_path):
 
 
 @pytest.fixture
-def tiny_training_recipes(monkeypatch, tmp_path) -> Path:
-    """Use tiny recipes, one layout, few tasks, and a part of the bundled release as training data."""
-    for name, recipe in RECIPES.items():
-        sizes: dict[str, Any] = {"steps": 1, "batch_size": 8} if recipe.plays else TINY
-        model = MODEL | {"recurrent_layers": 1, "dropout": 0.0} if recipe.plays else MODEL
-        monkeypatch.setitem(RECIPES, name, dataclasses.replace(recipe, model=model, train=sizes))
+def tiny_training_settings(monkeypatch, tmp_path) -> Path:
+    """Use tiny settings, one layout, few tasks, and a part of the bundled release as training data."""
+    for name, settings in REFERENCE_SETTINGS.items():
+        sizes: dict[str, Any] = {"steps": 1, "batch_size": 8} if settings.plays else TINY
+        model = MODEL | {"recurrent_layers": 1, "dropout": 0.0} if settings.plays else MODEL
+        monkeypatch.setitem(REFERENCE_SETTINGS, name, dataclasses.replace(settings, model=model, train=sizes))
     monkeypatch.setattr(reference, "RL2_HISTORIES", NoiseConfig(2, 10, start=(0.5, 0.5)))
     monkeypatch.setattr(reference, "OWN_HISTORIES", NoiseConfig(1, 10, start=(0.0, 0.0)))
     monkeypatch.setitem(reference.TRACK_PLAY, "layout", {"rearranged": 1})
@@ -143,8 +143,8 @@ def tiny_training_recipes(monkeypatch, tmp_path) -> Path:
 
 
 @pytest.mark.slow
-def test_reference_model_trains_on_rl2_histories_then_on_its_own_histories(tiny_training_recipes):
-    out = tiny_training_recipes
+def test_reference_model_trains_on_rl2_histories_then_on_its_own_histories(tiny_training_settings):
+    out = tiny_training_settings
     job = ReferenceJob("ad-reference", "layout", 0, out)
     seen: list[int] = []
     job.run(lambda step, speed: seen.append(step))

@@ -129,7 +129,7 @@ def collect_command(
 @click.option(
     "--name",
     "names",
-    type=Names("reference model", shared.lazy_attribute("icrl4aht_baselines.reference", "RECIPES")),
+    type=Names("reference model", shared.lazy_attribute("icrl4aht_baselines.reference", "REFERENCE_SETTINGS")),
     multiple=True,
     required=True,
     help="Model, such as ad-reference; repeat.",
@@ -180,7 +180,12 @@ def reference_command(
 
     from icrl4aht_baselines.agents.bundled import EVERY_TRACK, bundle_run, check_bundle_name
     from icrl4aht_baselines.agents.egos import find_agent
-    from icrl4aht_baselines.reference import RECIPES, ReferenceJob, check_learns_from_teacher, write_bundled_card
+    from icrl4aht_baselines.reference import (
+        REFERENCE_SETTINGS,
+        ReferenceJob,
+        check_learns_from_teacher,
+        write_bundled_card,
+    )
 
     if bundle:
         try:
@@ -201,14 +206,14 @@ def reference_command(
         ReferenceJob(name, of_track, seed, out, teacher, threads)
         for seed in range(seeds)
         for name in dict.fromkeys(names)
-        for of_track in RECIPES[name].tracks
+        for of_track in REFERENCE_SETTINGS[name].tracks
         if of_track in (*track, EVERY_TRACK)
     ]
     if not jobs:
         raise click.UsageError(
             f"--track {track[0]}: no model of this track exists for {' and '.join(names)}; leave out --track"
         )
-    taught = {job.track: None for job in jobs if not (job.recipe.plays or teacher)}
+    taught = {job.track: None for job in jobs if not (job.reference.plays or teacher)}
     teachers = [ReferenceJob("rl2-reference", of_track, 0, out, xla_threads=threads) for of_track in taught]
     if threads:  # as many threads as in workers: jobs resume only with an equal number
         limit_xla_threads(threads)
@@ -221,7 +226,7 @@ def reference_command(
         click.echo(f"{job.label}: {job.folder}")
     if bundle:
         for job in jobs:
-            sampled, role = not job.recipe.greedy, job.recipe.role
+            sampled, role = not job.reference.greedy, job.reference.role
             click.echo(f"bundled: {bundle_run(job.run_folder, bundle, job.track, sampled=sampled, role=role)}")
         click.echo(f"card: {write_bundled_card(bundle, jobs)}")
 

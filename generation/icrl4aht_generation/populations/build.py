@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pandas as pd
 from rich.console import Console
@@ -21,9 +22,14 @@ from icrl4aht_data.benchmark.facts import (
     layout_number,
     track_layouts,
 )
+from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.files import atomic_write, write_json
+from icrl4aht_data.utils.progress import progress_bars
+from icrl4aht_data.utils.text import markdown_table
+from icrl4aht_data.writing.splits import played_teammates, teammates_hash
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
@@ -39,7 +45,7 @@ from icrl4aht_generation.populations.train import (
     suite_checkpoints,
 )
 from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.teammates.distances import act_on_records, hamming_distances
+from icrl4aht_generation.teammates.distances import act_on_records, hamming_distances, split_distances
 from icrl4aht_generation.teammates.instances import published_teammates
 from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.references import REFERENCE_EGOS, stacked_policy_groups
@@ -148,6 +154,32 @@ def report_diversity(
         for algorithm in algorithms:
             _report_population(suite, layout, algorithm, greedy, console)
         _report_distances(suite, layout, algorithms, console)
+
+
+def report_splits(root: Path, stored: Path | None, console: Console) -> None:
+    """Print, for each training layout of a release, the smallest distance of validation to training teammates.
+
+    Args:
+        root: folder of the release.
+        stored: file for the distances, which the release's dataset card shows; None to write no file.
+        console: where to print.
+
+    Raises:
+        OptionError: if no training layout of the release has teammates in both splits.
+    """
+    dataset = load_icrl4aht(root)
+    with progress_bars(unit="layouts") as show:
+        found = split_distances(dataset, lambda done, total, name: show("distances", done, total, name))
+    if not found:
+        raise OptionError(f"{root}: no training layout has training and validation teammates; nothing to compare")
+    rows = [[name, str(one.train), str(one.validation), f"{one.least:.3f}"] for name, one in found.items()]
+    header = ["layout", "training teammates", "validation teammates", "smallest distance"]
+    console.print(markdown_table(header, rows, right=3))
+    if stored:
+        played = played_teammates(dataset.tasks.values(), dataset.provenance)
+        content = {"teammates": teammates_hash(played), "layouts": msgspec.to_builtins(found)}
+        with atomic_write(stored) as partial:
+            write_json(partial, content)
 
 
 def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, console: Console) -> None:

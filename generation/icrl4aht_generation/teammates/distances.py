@@ -27,12 +27,17 @@ from icrl4aht_data.benchmark.facts import (
     SAME_BEHAVIOUR,
     TESTED_ON,
 )
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import check_choice
 from icrl4aht_data.format.provenance import NearestTestTeammate
+from icrl4aht_data.format.schema import TEAMMATES
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.overcooked.tables import Tables
+from icrl4aht_data.utils.groups import grouped
+from icrl4aht_data.writing.splits import SplitDistance, played_teammates
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.padded import padded_layout
 from icrl4aht_generation.policy import Policy
@@ -235,6 +240,46 @@ def group_behaviours(actions: np.ndarray) -> list[int]:
         if found[-1] == len(first):
             first.append(own)
     return found
+
+
+def split_distances(dataset: Dataset, on_layout: Callable[[int, int, str], None]) -> dict[str, SplitDistance]:
+    """Return how differently a release's validation teammates act from its training teammates, by training layout.
+
+    Args:
+        dataset: a complete release.
+        on_layout: called with the number of finished layouts, the number of layouts, and the name of the next layout.
+
+    Returns:
+        Training layout of the benchmark with teammates in both splits -> distances.
+    """
+    suite, found = dataset.origin.fetch_folder(TEAMMATES), {}
+    played = played_teammates(dataset.tasks.values(), dataset.provenance)
+    by_layout = {
+        name: grouped(own, lambda task: task.split)
+        for name, own in grouped(played, lambda task: task.layout.name).items()
+        if name in TESTED_ON and {"train", "validation"} <= {task.split for task in own}
+    }
+    for number, (name, splits) in enumerate(by_layout.items()):
+        on_layout(number, len(by_layout), name)
+        actions = {split: _teammate_actions(get_layout(name), splits[split], suite) for split in splits}
+        train = actions["train"]
+        nearest = [float((train != own).mean(axis=1).min()) for own in actions["validation"]]
+        found[name] = SplitDistance(len(train), len(nearest), round(min(nearest), _DIGITS))
+    on_layout(len(by_layout), len(by_layout), "")
+    return found
+
+
+def _teammate_actions(layout: Layout, tasks: Sequence[Task], suite: Path) -> np.ndarray:
+    """Return the actions of teammates on the common states of a layout, int8 (teammates, T * N)."""
+    records, _ = common_states(layout)
+    learned = [task.teammate for task in tasks if task.teammate_family == "rl"]
+    scripts = with_equal_parameter_names([task.teammate for task in tasks if task.teammate_family != "rl"])
+    # Policies of one kind are compiled once.
+    groups = [
+        [build_teammate(None, one) for one in scripts],
+        [build_teammate(layout, one, suite=suite) for one in learned],
+    ]
+    return np.concatenate([act_on_records(layout, group, records).reshape(len(group), -1) for group in groups if group])
 
 
 def fill_table(

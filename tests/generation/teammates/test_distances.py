@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +18,7 @@ from icrl4aht_generation.teammates.distances import (
     group_behaviours,
     measure_draws,
     nearest_test,
+    split_distances,
 )
 from icrl4aht_generation.teammates.draws import read_draws
 from icrl4aht_generation.teammates.instances import INSTANCES, published_teammates
@@ -22,7 +26,9 @@ from icrl4aht_generation.teammates.references import reference_returns
 from icrl4aht_generation.teammates.registry import build_teammate
 from msgspec.structs import replace
 
+from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.errors import UnknownNameError
+from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask
 from icrl4aht_data.overcooked.layouts import get_layout
 
 LAYOUT = get_layout("cramped_up")
@@ -109,6 +115,27 @@ def test_test_teammate_has_distance_0_to_itself():
     found = nearest_test(SHIPPED, [build_teammate(None, entry) for entry in entries])
     assert [near.distance for near in found] == [0.0] * len(entries)
     assert (found[0].teammate, found[INSTANCES].teammate) == ("H3/t0", "H4/t0")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("optimized_actions")
+def test_split_distances_find_the_nearest_training_teammate():
+    """The second of two validation teammates also trains; layouts with one split are left out."""
+    mates = published_teammates(NAME, "assembly_line")
+    chosen = [("train", 0), ("train", 1), ("validation", 2), ("validation", 1)]
+    tasks = [make_task("teammate", split, NAME, mates[number], seed) for seed, (split, number) in enumerate(chosen)]
+    tasks.append(make_task("layout", "train", LAYOUT.name, mates[0], 9))
+    made = ProvenanceByTask({task.task_id: Provenance() for task in tasks})
+    origin = SimpleNamespace(fetch_folder=lambda name: None)
+    shown: list[tuple[int, int, str]] = []
+    for number, least in ((3, None), (4, 0.0)):
+        own = {task.task_id: task for task in (*tasks[:number], tasks[-1])}
+        dataset: Any = SimpleNamespace(tasks=own, provenance=made, origin=origin)
+        found = split_distances(dataset, lambda *progress: shown.append(progress))
+        assert [*found] == [NAME]
+        assert (found[NAME].train, found[NAME].validation) == (2, number - 2)
+        assert found[NAME].least == least if number == 4 else 0.02 < found[NAME].least < 1
+    assert shown[:2] == [(0, 1, NAME), (1, 1, "")]
 
 
 @pytest.mark.slow
