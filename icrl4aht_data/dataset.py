@@ -284,11 +284,11 @@ class Dataset(Selection):
         return make_environment(**known | options)
 
     def reset_options(self, history_id: int, episode: int = 0) -> dict[str, np.ndarray]:
-        """Return the options of `reset` that make a recovered environment repeat the start of a recorded episode.
+        """Return options for `reset` that make an environment of `recover_environment` repeat the start of an episode.
 
         The environment then starts at the recorded state, the teammate repeats its recorded actions, and each delivery
         is followed by the recorded recipe. If the ego repeats its recorded actions too, the states, observations and
-        rewards equal the recorded ones; random keys are not needed. After the recorded steps, the teammate's policy
+        rewards equal the recorded ones. After the recorded steps, the teammate's policy
         acts.
 
         Args:

@@ -73,7 +73,7 @@ def pytest_configure() -> None:
 
 
 def _remove_unfinished_entries(folder: Path) -> None:
-    """Remove cache entries without an access-time file, left by killed processes, since they block new entries."""
+    """Remove cache entries that killed processes left without an access-time file; such entries block new ones."""
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / ".lockfile"):
         for entry in folder.glob("*-cache"):
@@ -175,7 +175,7 @@ def built(shared_folder) -> Path:
 
 @pytest.fixture(scope="session")
 def published_folder(tmp_path_factory) -> tuple[Path, list[dict[str, np.ndarray]]]:
-    """Return small files in the published format, written by hand, and their arrays (read-only)."""
+    """Return a folder of small files in the published format, and their arrays; tests must not change either."""
     folder = tmp_path_factory.mktemp("theirs") / "files"
     return folder, write_published_files(folder)
 

@@ -17,7 +17,7 @@ from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.page import write_page
 from icrl4aht_baselines.report.results import EPISODE_BLOCKS, EvaluationRun, evaluate_agent
-from icrl4aht_baselines.report.scores import blocks_text
+from icrl4aht_baselines.report.scores import block_returns_text
 from icrl4aht_baselines.report.statistics import mean_interval
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
@@ -132,7 +132,7 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> Path:
     own, cleared = evaluate_into(agent, agent.name), evaluate_into(agent, "cleared", control="cleared")
     runs = [own, cleared, *(evaluate_into(find_agent(name), name) for name in _AGENTS)]
     for run in runs:
-        click.echo(f"{run.agent}, mean return in episodes {blocks_text([*run.returns.values()])}")
+        click.echo(f"{run.agent}, mean return in episodes {block_returns_text([*run.returns.values()])}")
 
     print_stage(6, "drawing")
     draw_adaptation(runs, picture)

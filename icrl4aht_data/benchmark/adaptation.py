@@ -57,9 +57,9 @@ def _mean_returns(entry: Mapping[str, Any]) -> list[float]:
 
 
 def headroom_text(entry: Mapping[str, Any]) -> str:
-    """Return the informed ego's return minus that of the episodic ego, with its interval in parentheses.
+    """Return the informed ego's mean return minus the episodic ego's, with the difference's interval in parentheses.
 
-    The interval is a 95 % Student's t interval over the training seeds; there is none for a single seed.
+    The interval is a 95 % Student's t interval over the training seeds; it is left out for a single seed.
     """
     informed, episodic = _mean_returns(entry)
     interval = " ({:+z.1f} to {:+z.1f})".format(*entry["interval"]) if entry.get("interval") else ""

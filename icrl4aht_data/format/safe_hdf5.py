@@ -75,7 +75,9 @@ def read_attributes(file: h5py.File) -> dict[str, Any]:
     for number, name in enumerate(file.attrs):
         attribute = file.attrs.get_id(name)
         if number == _ATTRIBUTES or attribute.shape or _type_class(attribute) not in (h5t.INTEGER, h5t.STRING):
-            raise ValueError(f"attribute {name!r}: expected at most {_ATTRIBUTES} attributes, each a number or string")
+            raise ValueError(
+                f"attribute {name!r}: expected a single number or string, and at most {_ATTRIBUTES} attributes in all"
+            )
         found[name] = file.attrs[name] if _type_class(attribute) == h5t.INTEGER else str
     return found
 

@@ -1,6 +1,6 @@
-"""Utilities for files: text and JSON, hashes, atomic writes, locks between processes, safe paths, full disks.
+"""Utilities for files: text and JSON, hashes, atomic writes, locks between processes, safe paths, disk-full errors.
 
-Sizes are checked before reading, because a file may be a pipe, which never ends, or a sparse file of a terabyte.
+Sizes are checked before reading: a pipe never ends, and a sparse file may have a terabyte.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
         start = _STARTS.get(file.suffix, b"") if names is None else b""
         if file.exists() and not starts_with(file, start):
             wrong = f"{file}: not a {file.suffix} file that this package writes"
-            raise OptionError(f"{wrong}, so it is not replaced; give another name, or remove it")
+            raise OptionError(f"{wrong}, so --overwrite does not replace the file; give another name, or remove it")
 
 
 def starts_with(path: Path, start: bytes) -> bool:

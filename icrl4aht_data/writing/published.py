@@ -271,8 +271,8 @@ def _tasks(histories: list[_PublishedHistory], source: Path, kind: Kind) -> list
         one, two = ((t.track, t.split, t.layout.name, t.teammate_family, t.teammate_kind) for t in (line, task))
         if one != two:
             raise PublishedFormatError(
-                f"{source / HISTORIES_INDEX}: history {history.line['history_id']} has {one}, but its task "
-                f"{task.task_id!r} has {two}; correct the index or the tasks"
+                f"{source / HISTORIES_INDEX}: history {history.line['history_id']}: expected track, split, layout, "
+                f"family and kind {two} as in task {task.task_id!r}, found {one}; correct the index or the tasks"
             )
     return [(known[name], members) for name, members in by_task.items()]
 

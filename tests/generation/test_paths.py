@@ -29,7 +29,7 @@ def reference_move(layout: Layout, cell: int, action: int) -> int:
 
 @lru_cache
 def reference_distances(layout: Layout) -> np.ndarray:
-    """Return the numbers of steps between floor cells by the Floyd-Warshall algorithm, int of shape (cells, cells)."""
+    """Return the shortest-path lengths between floor cells, by Floyd-Warshall, int of shape (cells, cells)."""
     distance = np.full((layout.cells, layout.cells), NOWHERE)
     for cell, letter in enumerate("".join(layout.rows)):
         if letter in " A":

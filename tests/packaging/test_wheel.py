@@ -112,35 +112,35 @@ def install_packages(*arguments: str | Path) -> None:
 
 
 @pytest.fixture(scope="session")
-def build_requirements(tmp_path_factory) -> Path:
+def build_backend_folder(tmp_path_factory) -> Path:
     """Return a folder with the installed build requirements."""
     folder = tmp_path_factory.mktemp("backend")
     install_packages(sys.executable, "--target", folder, *PROJECT["build-system"]["requires"])
     return folder
 
 
-def build_archive(build_requirements: Path, source: Path, target: Path, kind: str) -> Path:
+def build_archive(build_backend_folder: Path, source: Path, target: Path, kind: str) -> Path:
     """Build the wheel or the source archive of a folder, and return its path."""
     command = (sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", target)
-    done = run_isolated(*command, cwd=source, env={"PYTHONPATH": str(build_requirements)})
+    done = run_isolated(*command, cwd=source, env={"PYTHONPATH": str(build_backend_folder)})
     assert done.returncode == 0, done.stderr
     (path,) = target.iterdir()
     return path
 
 
 @pytest.fixture(scope="session")
-def sdist(build_requirements, tmp_path_factory) -> Path:
+def sdist(build_backend_folder, tmp_path_factory) -> Path:
     """Return the folder of the unpacked source archive."""
     folder = tmp_path_factory.mktemp("sdist")
-    with tarfile.open(build_archive(build_requirements, ROOT, folder / "packed", "sdist")) as archive:
+    with tarfile.open(build_archive(build_backend_folder, ROOT, folder / "packed", "sdist")) as archive:
         archive.extractall(folder, filter="data")
     return folder / f"{READER}-{VERSION}"
 
 
 @pytest.fixture(scope="session")
-def wheel(build_requirements, sdist, tmp_path_factory) -> Path:
+def wheel(build_backend_folder, sdist, tmp_path_factory) -> Path:
     """Return the path of the wheel, which is built from the unpacked source archive, not from the repository."""
-    return build_archive(build_requirements, sdist, tmp_path_factory.mktemp("wheel"), "wheel")
+    return build_archive(build_backend_folder, sdist, tmp_path_factory.mktemp("wheel"), "wheel")
 
 
 def files_below(folder: Path) -> set[str]:

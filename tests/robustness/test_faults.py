@@ -105,7 +105,7 @@ class SmallRelease:
         finally:
             path.write_bytes(right)
 
-    def check_damage(self, cache: CacheMode = "ram") -> None:
+    def assert_damage_is_found(self, cache: CacheMode = "ram") -> None:
         """Assert that `verify` finds the damage, and that reading returns correct data or raises a package error."""
         assert not verify_release(self.root).ok, "verify finds nothing"
         with suppress(Icrl4ahtError):
@@ -127,7 +127,7 @@ def test_flipped_bit_never_changes_the_data_that_is_read(small_release, cache_fo
         data = bytearray(path.read_bytes())
         data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
         with small_release.damaged(path, bytes(data)):
-            small_release.check_damage(modes[number % 3])
+            small_release.assert_damage_is_found(modes[number % 3])
 
 
 VALUES = [0, -1, 2**31, 2**63, 10**400, 1e300, -0.5, None, True, "", "x", "\0", "../x", "/etc", "ü" * 9, [], [[]], {}]
@@ -165,7 +165,7 @@ def test_mutated_text_files_raise_only_package_errors(small_release, cache_folde
                     fetch_planned(plan_download(server.url, to=tmp_path / f"{number}"))
                     assert small_release.read(tmp_path / f"{number}") == small_release.before, "other data, downloaded"
                 continue
-            small_release.check_damage()
+            small_release.assert_damage_is_found()
             with small_release.damaged(small_release.root / MANIFEST, (small_release.root / MANIFEST).read_bytes()):
                 write_manifest(small_release.root)
                 verify_release(small_release.root)

@@ -135,7 +135,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
         raise UnknownNameError(f"{unknown_name('agent', name, agent_names())} {hint}")
     if model is None and not (Path(name) / CONFIG).is_file():
         raise UnknownNameError(
-            f"{name}: expected a run folder, but {CONFIG} is missing; `icrl4aht-data train` makes one"
+            f"{name}: expected a run folder, but {CONFIG} is missing; `icrl4aht-data train` makes run folders"
         )
     own_greedy = model is None or not model.sampled
     mode = PlayMode(acting or "cached", own_greedy if greedy is None else greedy)

@@ -269,11 +269,11 @@ def submit_command(
 ) -> None:
     """Make a file of results for the page that `results` writes.
 
-    Each FOLDER was written by `evaluate`, under the protocol `seeded`, with the seeds 0, 1 and 2. Together the folders
-    must hold all test tasks of one track or more, and state what the agent was trained on. Give several
-    folders for tracks, or training runs, that were evaluated separately. Results of `evaluate --controls` are included.
-    Results with a model's other way of choosing actions, such as `evaluate --sampled`, are shown in separate rows. A
-    pull request that adds the file puts the agent on the page; `icrl4aht-data results FILE` shows a preview.
+    Each FOLDER must be written by `evaluate` under the protocol `seeded` with the seeds 0, 1 and 2. Together the
+    folders must hold all test tasks of at least one track, and their results must state the agent's training data.
+    Give several folders if tracks or training runs were evaluated separately. Results of `evaluate --controls` are
+    included. Results with a non-default choice of actions, such as `evaluate --sampled`, get separate rows. A pull
+    request that adds the file puts the agent on the page; `icrl4aht-data results FILE` shows a preview.
     """
     from icrl4aht_baselines.report import stored_results, submission
 

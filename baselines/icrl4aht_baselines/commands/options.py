@@ -76,7 +76,7 @@ tasks_options = (
         default=("test",),
         help="Tasks to play: test; or validation and diverse, to choose models by; repeat for several.",
     ),
-    # Names are checked only when the manifest is read, because the release next to it may define the layout.
+    # Layout names are checked after the manifest is read, because its release may define layouts.
     click.option("--layout", "layouts", type=RELEASE_LAYOUT, **_ONLY_LAYOUTS),
     click.option(
         "--family", "families", type=FAMILY, multiple=True, help="Only with teammates of this family; repeat."

@@ -179,11 +179,11 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     """Play an episode and draw it as a GIF."""
     from icrl4aht_baselines.agents.egos import find_agent
     from icrl4aht_baselines.evaluate.protocols import get_protocol
-    from icrl4aht_baselines.report.gifs import save_episodes
+    from icrl4aht_baselines.report.gifs import save_episode_gifs
 
     check_output(out, overwrite)
     task = published_task(layout, teammate)
-    (shown,) = save_episodes({1: out}, task, find_agent(ego).make, get_protocol(protocol), seed=seed)
+    (shown,) = save_episode_gifs({1: out}, task, find_agent(ego).make, get_protocol(protocol), seed=seed)
     mate = f"{task.teammate_family}/t{task.teammate['theta_id']}"
     click.echo(f"{ego} with {mate}: return {shown.earned:g}; wrote {out}")
 

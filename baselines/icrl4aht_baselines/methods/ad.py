@@ -43,12 +43,12 @@ class StepOutput(NamedTuple):
 
 
 class WindowMemory(NamedTuple):
-    """Memory of an acting ego: the steps of its window, and the trunk's memory of these steps.
+    """Memory of an ego: the tokens of its window, and the trunk's state after them.
 
     Attributes:
-        tokens: float32 (K, D), tokens of the window's steps, followed by unused rows.
+        tokens: float32 (K, D), tokens of the window's steps; further rows are unused.
         steps: int32 (), number of steps in the window.
-        trunk: the trunk's memory of these steps; None if the complete window is computed in every step.
+        trunk: the trunk's state; None if the trunk processes the complete window in every step.
     """
 
     tokens: Float[Array, "K D"]
@@ -85,7 +85,7 @@ class StepModel(nn.Module):
 
     def act(self, step: StepInput, done: Bool[Array, ""], memory: WindowMemory) -> tuple[Any, WindowMemory]:
         """Return the head's output for one step of an acting ego, and the memory that includes this step."""
-        tokens, steps, states = self._drop_if_full(memory)
+        tokens, steps, states = self._drop_oldest_if_full(memory)
         token = self.tokens(step)
         tokens = tokens.at[steps].set(token)
         if states is None:
@@ -94,7 +94,7 @@ class StepModel(nn.Module):
             feature, states = self.trunk.advance(token, states)
         return self.head(feature), WindowMemory(tokens, steps + 1, states)
 
-    def _drop_if_full(self, memory: WindowMemory) -> WindowMemory:
+    def _drop_oldest_if_full(self, memory: WindowMemory) -> WindowMemory:
         """Return the memory with space for a step: a full window loses its oldest steps.
 
         The trunk's memory is then computed again from the remaining steps, because it depends on the dropped steps.

@@ -470,7 +470,7 @@ class PlayTrainer:
         return np.concatenate(found)
 
     def programs(self, params: Any, tasks: Sequence[RolloutState]) -> list[Callable[..., Any]]:
-        """Return `_Player.episodes` of each player, compiled for the shapes of the player's running tasks.
+        """Return each player's `_Player.episodes`, compiled for the shapes of the player's rollout states `tasks`.
 
         The first call compiles for all players in parallel, since each compilation takes seconds and uses one core.
         """

@@ -54,7 +54,7 @@ class EpisodePair(NamedTuple):
     episodes: tuple[ShownEpisode, ...] = ()
 
 
-def save_episodes(
+def save_episode_gifs(
     paths: Mapping[int, Path],
     task: Task,
     make_ego: MakeEgo,
@@ -128,7 +128,7 @@ def _draw_result(run: EvaluationRun, cell: ResultCell, prefix: Path, suite: Path
                 "results with swapped teammates have no GIFs, because another teammate played the earlier episodes"
             )
         ego, forget = restore_ego(source), bool(source.detail("forget"))
-        shown = save_episodes(paths, task, ego, protocol, seed=seed, cell=24, suite=suite, forget=forget)
+        shown = save_episode_gifs(paths, task, ego, protocol, seed=seed, cell=24, suite=suite, forget=forget)
         return EpisodePair(cell, title, origin, shown)
     except Icrl4ahtError as error:
         return EpisodePair(cell, title, f"No picture: {error}. {origin}")

@@ -34,7 +34,7 @@ from icrl4aht_baselines.report.results import (
 )
 from icrl4aht_baselines.report.scores import (
     add_scales,
-    blocks_text,
+    block_returns_text,
     bundled_ids_by_cell,
     cell_scales,
     find_headlines,
@@ -107,7 +107,7 @@ def table_score(
     complete = all(len(run.tasks(cell)) == count for cell, count in instances.items())
     counts = f"{len(means[0])} of {counted_noun(instances.get(cells[0], 0), 'instance')}"
     score, overlaps = find_score(run.returns, scored_cells(run, played, scales), scales), run.overlaps(played)
-    blocks = blocks_text(returns)
+    blocks = block_returns_text(returns)
     notes = [
         f"{len(played)} of {len(cells)} cells" if len(played) < len(cells) else "",
         "" if complete else counts if len(cells) == 1 else "incomplete cells",

@@ -378,7 +378,7 @@ def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str
     return lines
 
 
-def blocks_text(cells: Sequence[CellReturns]) -> str:
+def block_returns_text(cells: Sequence[CellReturns]) -> str:
     """Return text with the mean return in each block of episodes, such as "1: 10.0, 2-5: 12.0".
 
     Args:
@@ -450,7 +450,7 @@ def find_headlines(run: EvaluationRun) -> list[Headline]:
                 tasks=f"{counted} with headroom, of {len(played)} played" if scored else counted,
                 score=find_score(run.returns, scored, scales),
                 mean=mean_interval(*(of.mean for of in returns)),
-                blocks=blocks_text(returns) if min(run.cells[cell].shape[1] for cell in cells) > 1 else "",
+                blocks=block_returns_text(returns) if min(run.cells[cell].shape[1] for cell in cells) > 1 else "",
                 why_no_score="" if scored else _missing_score_reason(run, played, scales),
                 overlaps=overlaps,
             )

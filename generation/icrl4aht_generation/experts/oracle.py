@@ -125,8 +125,8 @@ class OracleView:
         facts: precomputed properties of the layout.
         scene: the state from the ego's point of view.
         memory: memory of the ego.
-        obstacle: int32 (), number of the obstacle in `LayoutFacts.ways`.
-        time: int32 (cells,), steps until the ego faces a cell, around the teammate.
+        obstacle: int32 (), index into `LayoutFacts.ways` for the teammate's cell; 0 if the teammate blocks no path.
+        time: int32 (cells,), steps until the ego faces each cell, on paths around the teammate.
         items: uint8 (cells,), items on counters.
         sources: bool (3, cells), where each ingredient can be taken.
         contents: uint8 (P,), contents of the pots, without the cooked flag.
@@ -136,9 +136,9 @@ class OracleView:
         recipes: uint8 (Q,), item bytes of the recipes that the ego may cook.
         stock: int32 (Q,), soups of each recipe that need no more ingredients.
         missing: int32 (P, Q, 3), ingredients that each pot still needs for each recipe; negative for surplus.
-        risky: bool (), the teammate is likely to take any soup out of the ego's pots, also a wrong one.
-        careful: bool (), the teammate also fills these pots, where a wrong soup would block the right soup.
-        mate_delivers: bool (), the teammate is about to deliver a right soup, which changes the recipe.
+        risky: bool (), whether the teammate is likely to take any soup out of the ego's pots, even a wrong soup.
+        careful: bool (), `risky`, and the teammate also fills the ego's pots: a wrong soup would block the right one.
+        mate_delivers: bool (), whether the teammate is about to deliver a right soup, which changes the recipe.
     """
 
     facts: LayoutFacts
@@ -175,7 +175,7 @@ class OracleView:
 
     @cached_property
     def steps_to_pots(self) -> Int[Array, "cells P"]:
-        """Steps that an ego which faces one cell needs until it faces a pot, for all cells and pots."""
+        """Number of steps from facing each cell to facing each pot."""
         return _decode_steps(jnp.asarray(self.facts.leg))
 
     def cost_at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:

@@ -55,11 +55,11 @@ class _SampledTasks(_Spread, kw_only=True):
 
 
 class _Generated(Struct, forbid_unknown_fields=True):
-    """Fields of one table [[tasks.generated]]; each table adds generated layouts of one family.
+    """Fields of one table [[tasks.generated]] of a profile, which adds generated layouts of one family.
 
     Attributes:
         family, seed, count, split: arguments of `generate_layouts`.
-        teammates: number of tasks of each layout in the sources "ppo" and "noise".
+        teammates: number of sampled teammates of each layout, with one task each in the sources "ppo" and "noise".
     """
 
     family: str

@@ -68,11 +68,11 @@ def choose_labeller(folders: Sequence[Path], task: Task, suite: Path) -> tuple[P
     Returns:
         Folder of the checkpoint, and its record in the provenance of the task.
     """
-    found = [learner_labeller(folder, task, suite) for folder in folders]
+    found = [choose_artefact_labeller(folder, task, suite) for folder in folders]
     return max(found, key=lambda one: one[1].return_greedy or 0.0)
 
 
-def learner_labeller(folder: Path, task: Task, suite: Path) -> tuple[Path, ExpertLabels]:
+def choose_artefact_labeller(folder: Path, task: Task, suite: Path) -> tuple[Path, ExpertLabels]:
     """Measure the checkpoints of a finished artefact, and choose the checkpoint that labels the histories.
 
     The measurements are stored in the artefact's file `LABELLER_RETURNS`, and reused.

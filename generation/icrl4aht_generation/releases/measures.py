@@ -61,7 +61,7 @@ def learned_reference_returns(tasks: Sequence[Task], suite: Path) -> dict[str, R
     for layout, own in grouped(tasks, lambda task: task.layout).items():
         folders = [checkpoint_folder(suite, task.teammate) for task in own]
         mates = [build_learned(layout, folder) for folder in folders]
-        partners = [build_learned(layout, _training_partner(folder), "sampled") for folder in folders]
+        partners = [build_learned(layout, _training_partner_folder(folder), "sampled") for folder in folders]
         for task, ego, mate, returns in zip(own, partners, mates, reference_returns(layout, mates), strict=True):
             play = _compiled_self_play(layout, ego._replace(params=()), mate._replace(params=()))
             self_play = float(np.asarray(play(ego.params, mate.params)).mean())
@@ -69,7 +69,7 @@ def learned_reference_returns(tasks: Sequence[Task], suite: Path) -> dict[str, R
     return found
 
 
-def _training_partner(folder: Path) -> Path:
+def _training_partner_folder(folder: Path) -> Path:
     """Return the training partner's folder for a checkpoint folder m<k>/c<n>: a best response, or the same folder."""
     response = folder.parent.parent / RESPONSES / folder.parent.name
     return response if response.is_dir() else folder

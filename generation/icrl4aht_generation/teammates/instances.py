@@ -47,7 +47,7 @@ def published_teammates(layout: str, family: str) -> list[dict[str, Any]]:
 
 
 def published_task(layout: str, teammate: str) -> Task:
-    """Return the task of a layout with a test instance such as "H3/t1"; the split is "test" or "train".
+    """Return the task of a layout and a test teammate such as "H3/t1"; split "test" on test layouts, else "train".
 
     Raises:
         UnknownNameError: if the layout, family or instance does not exist.

@@ -175,7 +175,7 @@ def test_headroom_card_lists_layouts_and_families_without_headroom(tmp_path):
 def test_episodes_of_tasks_with_headroom_are_shown(invented_responses, tmp_path, monkeypatch):
     """Episodes are shown for layouts and families with headroom, and not for reference egos."""
     (tmp_path / "a.gif").write_bytes(GIF)
-    monkeypatch.setattr(gifs, "save_episodes", lambda *a, **k: (ShownEpisode(1, 7.0, tmp_path / "a.gif"),))
+    monkeypatch.setattr(gifs, "save_episode_gifs", lambda *a, **k: (ShownEpisode(1, 7.0, tmp_path / "a.gif"),))
     monkeypatch.setattr(gifs, "restore_ego", lambda source: source)
 
     def fake_run(agent: str, **options) -> EvaluationRun:

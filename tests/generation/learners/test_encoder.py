@@ -65,7 +65,7 @@ def test_compact_inputs_give_the_features_and_gradients_of_observations(kind):
 
 
 def test_only_entries_that_can_differ_from_0_have_nonzero_initial_weights():
-    """Observation entries that are always 0 on the encoder's layout start with weight 0, thus without effect."""
+    """The encoder's initial weights are 0 for observation entries that are always 0 on its layout."""
     obs, view = jnp.asarray(observe(LAYOUT, RECORDS, 0)), CompactView("mlp", (LAYOUT,))
     kernels = {}
     for name, module, seen in (

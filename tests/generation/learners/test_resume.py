@@ -120,7 +120,7 @@ class TestStateFile:
         assert [path.name for path in file.path.parent.iterdir()] == ["s.safetensors"]
 
     def test_equal_states_give_equal_bytes(self, file):
-        """Files do not depend on the random order in which safetensors writes metadata."""
+        """Metadata is written in a fixed order; safetensors itself uses a random order."""
         contents = set()
         for _ in range(8):
             file.save(state(), 7)

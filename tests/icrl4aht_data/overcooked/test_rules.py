@@ -172,7 +172,7 @@ def ring_state(slot: int, hand: int = 0, **fields) -> np.ndarray:
 def test_button_press_costs_5_and_shows_the_recipe_for_9_observations(slot):
     record = ring_state(slot, recipe=RECIPE_000)
     row = 3 if slot == 0 else 1
-    recipe_channel = 2 * 10 + 6 + 3 + 5 + 2  # channel of ingredient 0 of the recipe, for three ingredient types
+    recipe_channel = 2 * 10 + 6 + 3 + 5 + 2  # recipe channel of ingredient type 0, if there are three types
     after = interact(slot, record, RING)
     assert (after.reward, after.shaped, after.hands) == (-5, [0, 0], [0, 0])
     timers, visible = [], []

@@ -138,7 +138,7 @@ class TestFaultyFiles:
             ),
             (
                 edit_index_line(1, teammate_kind="other"),
-                r"index\.jsonl: history 1 has .*'other'.*, but its task 'task_a' has",
+                r"index\.jsonl: history 1: expected track, .* as in task 'task_a', found .*'other'",
             ),
             (edit_index_line(1, T="many"), r"index\.jsonl, line 2: Expected `int`, got `str` - at `\$\.T`"),
             (edit_index_line(3, layout="nowhere"), r"index\.jsonl, line 4: unknown layout"),

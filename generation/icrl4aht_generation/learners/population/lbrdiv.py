@@ -73,7 +73,7 @@ class LBRDiv(Algorithm):
         there are new episodes and both returns are known.
         """
         k = self.members
-        # `returns` is indexed [ego, teammate]; best responses, K..2K-1, are the egos.
+        # `returns` is indexed [ego, teammate]; the egos are the best responses, policies K..2K-1.
         known = memory.known | seen[k:, :k].T
         latest = jnp.where(seen[k:, :k].T, returns[k:, :k].T, memory.returns)
         own = jnp.diag(latest)[:, None]

@@ -93,7 +93,7 @@ class Algorithm:
         return ()
 
     def weights(self, memory: Any) -> Float[Array, " terms"]:
-        """Return the weight of each term in the objective that is maximized; negative to minimize a return."""
+        """Return the weight of each term in the maximized objective; a negative weight minimizes the term."""
         raise NotImplementedError
 
     def adapt(self, memory: Any, returns: Float[Array, "P P"], seen: Bool[Array, "P P"]) -> Any:

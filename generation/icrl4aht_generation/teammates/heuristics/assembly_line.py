@@ -46,7 +46,7 @@ def _hesitation_factor(scene: Scene) -> Array:
 
 
 def _choose_action(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Choose an action by the first rule that applies. Return whether it is exempt from mistakes, and the action."""
+    """Return whether the action is exempt from mistakes, and the action chosen by the first rule that applies."""
     empty, plate, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_ingredient
     soup, cooking = jnp.any(scene.cooked), jnp.any(scene.cooking)
     final = scene.holds_dish | (ingredient & soup)

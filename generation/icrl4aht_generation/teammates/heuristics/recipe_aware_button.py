@@ -46,7 +46,7 @@ class ButtonMemory(NamedTuple):
 
 
 def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple[Int[Array, ""], ButtonMemory]:
-    """Return the action of an H1 teammate, and the next memory."""
+    """Return the action of a teammate of family H1, and its memory after the step."""
     # The teammate sees the recipe while a button is lit, and always on layouts with an indicator.
     shown = jnp.any(scene.indicators) | scene.button_lit
     recipe, seen = jnp.where(shown, scene.state.recipe, memory.recipe), jnp.where(shown, memory.clock, memory.seen)
