@@ -415,6 +415,6 @@ def diversity(
     if bundle and not release:
         raise OptionError("--bundle: expected --release as well, whose distances are written")
     if release:
-        report_splits(release, card_file(DISTANCES_FILE) if bundle else None, console)
+        report_splits(release, card_file("headroom.json").with_name(DISTANCES_FILE) if bundle else None, console)
     else:
         report_diversity(suite, layouts, algorithms, greedy, console)

@@ -455,7 +455,11 @@ def _distinct_values(tasks: Iterable[_TaskFacts], name: str) -> list[Any]:
 
 def _generation_facts(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
     """Return how the histories were generated: egos, filters of histories, noise schedules, versions."""
-    noise = {json.dumps([task.made.source, task.made.noise]): task.made for task in tasks if task.made.noise}
+    noise = {
+        json.dumps([task.made.source, task.made.noise, task.made.expert and task.made.expert.action]): task.made
+        for task in tasks
+        if task.made.noise
+    }
     labels = {"profile": "profile", "code_version": "icrl4aht-data", "jax_version": "JAX", "platform": "platform"}
     versions = {label: ", ".join(map(str, _distinct_values(tasks, name))) for name, label in labels.items()}
     # names of layouts, by settings of the filter that selected their histories

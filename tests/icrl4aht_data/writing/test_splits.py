@@ -27,7 +27,7 @@ def test_bundled_validation_teammates_act_unlike_all_training_teammates():
     dataset = load_icrl4aht()
     played = played_teammates(dataset.tasks.values(), dataset.provenance)
     found = read_distances(played)
-    assert [*found] == ["test_wide", "demo_simple", "demo_wide", "asymm_both", "cramped_up"]
+    assert {*found} == {"test_wide", "demo_simple", "demo_wide", "asymm_both", "cramped_up"}
     for name, distance in found.items():
         own = [task.split for task in played if task.layout.name == name]
         assert (own.count("train"), own.count("validation")) == (distance.train, distance.validation)
