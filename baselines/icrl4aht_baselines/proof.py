@@ -88,7 +88,7 @@ class ProofOptions:
 
     Attributes:
         root: folder or address of a release; None for the bundled release.
-        steps: number of training steps; with the defaults, a job takes about 35 minutes on a core.
+        steps: number of training steps; with the defaults, a job takes about 30 minutes on a core.
         batch_size: number of windows or contexts in a batch.
         context: K, steps of a window or transitions of a context.
         tasks: name of a set -> its tasks; by default the validation tasks that `proof_tasks` returns.

@@ -271,8 +271,8 @@ def proof_command(root: Any, histories: tuple[str, ...], learner: tuple[str, ...
 
     Trains small AD and DPT models on the release only, and evaluates them on validation tasks. On track `preference`
     each model also plays with its memory cleared before each episode. On track `teammate` the models are compared
-    with rl2-reference. Training a model takes about 35 minutes on one core. Writes OUT/proof.json, which the release's
-    card shows. Finished runs are reused, and stopped runs resume.
+    with rl2-reference. Training and evaluating a model takes about 30 minutes on one core. Writes OUT/proof.json, which
+    the release's card shows. Finished runs are reused, and stopped runs resume.
     """
     from icrl4aht_baselines.proof import LEARNERS, ProofJob, ProofOptions, run_references, write_proof
 
