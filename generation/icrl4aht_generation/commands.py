@@ -403,7 +403,7 @@ def teammates(
 def diversity(
     layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool, release: Path | None, bundle: bool
 ) -> None:
-    """Report how much the teammates of a suite or of a release differ.
+    """Report how much a suite's or a release's teammates differ.
 
     Prints self-play and cross-play returns of each population, and mean Hamming distances (share of states in which two
     teammates act differently) between algorithms and families of heuristics. With --release, prints for each training

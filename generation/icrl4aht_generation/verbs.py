@@ -13,5 +13,7 @@ VERBS = (
     Verb("check", f"{_CLI}:check", "Generate", "Compare two generated releases bit for bit."),
     Verb("research draws", f"{_CLI}:draws", _TASKS, "Sample heuristic teammates for tasks, and measure them."),
     Verb("research manifests", f"{_CLI}:manifests", _TASKS, "Write the package's manifests with sampled teammates."),
-    Verb("research diversity", f"{_CLI}:diversity", _TASKS, "Report how much the teammates of a suite differ."),
+    Verb(
+        "research diversity", f"{_CLI}:diversity", _TASKS, "Report how much a suite's or a release's teammates differ."
+    ),
 )
