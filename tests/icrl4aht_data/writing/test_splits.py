@@ -42,5 +42,5 @@ def test_bundled_validation_teammates_act_unlike_all_training_teammates():
         assert distance.validation >= 6
         assert distance.least >= 0.1
     least = min(distance.least for distance in found.values())
-    text = f"acts differently from every training teammate in {least:.0%} of states or more"
+    text = f"act differently from every training teammate in {least:.0%} of states or more"
     assert text.replace("%", " %") in (MINI / RELEASE_CARD).read_text(encoding="utf-8")
