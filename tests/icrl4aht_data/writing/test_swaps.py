@@ -33,7 +33,7 @@ def test_card_describes_changes_of_teammates(swap_release):
     content = card_facts(swap_release)
     assert (content["views"], content["swapped"]) == ({"ego": {"ppo": 4}}, 4)
     card = render_card(content)
-    assert "In 4 histories the teammate changes" in card and "(`ego`) in 4 histories of `ppo`" in card
+    assert "In 4 histories the teammate changes" in card and "(`ego`) in 4 `ppo` histories" in card
 
 
 def test_entries_name_the_teammate_of_each_episode(swap_release):
