@@ -413,7 +413,7 @@ def diversity(
     from icrl4aht_generation.populations.build import report_diversity, report_splits
 
     if bundle and not release:
-        raise OptionError("--bundle: expected --release as well, whose distances are written")
+        raise OptionError("--bundle stores the distances of a release; also give --release FOLDER")
     if release:
         report_splits(release, card_file("headroom.json").with_name(DISTANCES_FILE) if bundle else None, console)
     else:

@@ -1,6 +1,6 @@
 """Measured distances between a release's validation and training teammates, for the release's dataset card.
 
-`icrl4aht-data research diversity --root RELEASE` measures them; `cards/split_distances.json` has those of the bundled
+`icrl4aht-data research diversity --release FOLDER` measures them; `cards/split_distances.json` has those of the bundled
 release.
 """
 
