@@ -31,8 +31,7 @@ from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
-from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.writing.proof import histories_hash
+from icrl4aht_data.writing.proof import RUN_KEY, histories_hash, runs_on
 
 TEAMMATE_TRACK = "teammate"
 
@@ -211,44 +210,43 @@ def _mean_returns(agent: NamedEgo, name: str, tasks: Sequence[Task], folder: Pat
 
 
 def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[str, float]]], path: Path) -> Path:
-    """Write the returns of finished jobs: an entry for each source and learner, with a value for each training seed.
+    """Write the returns of finished jobs, with an entry for each training run.
 
     Args:
         jobs: training jobs; unfinished jobs are skipped.
         references: returns from `run_references`.
-        path: path of the file. Models in an earlier file that were trained and evaluated with the same settings, but on
-            other histories or with other labels, are kept.
+        path: path of the file. An earlier file keeps the entries of other training runs, if these runs had the same
+            settings of training and evaluation, and learned from the same histories.
     """
     stay, expert = (references[TEAMMATE_TRACK][name]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
-    finished, models = [job for job in jobs if job.is_finished()], []
-    options, dataset = jobs[0].options, load_icrl4aht(jobs[0].options.root)
-    for (source, learner), own in grouped(finished, lambda job: (job.source, job.learner)).items():
-        results = [job.result() for job in own]
-        entry = {
-            "histories": source,
-            "learner": LEARNERS[learner].title,
-            "histories_sha256": histories_hash(dataset.index, source),
-            "seeds": [job.seed for job in own],
-            "minutes": [one["minutes"] for one in results],
+    options, dataset, runs = jobs[0].options, load_icrl4aht(jobs[0].options.root), []
+    for job in (job for job in jobs if job.is_finished()):
+        returns, minutes = job.result()["returns"], job.result()["minutes"]
+        entry: dict[str, Any] = {
+            "histories": job.source,
+            "learner": LEARNERS[job.learner].title,
+            "seed": job.seed,
+            "histories_sha256": histories_hash(dataset.index, job.source),
+            "minutes": minutes,
         }
         for memory, control in (("", ""), ("_cleared", " cleared")):
             for when, block in (("first", "1"), ("late", "6-20")):
-                entry[when + memory] = [one["returns"][PREFERENCE + control][block] for one in results]
-        earned = [one["returns"][TEAMMATE_TRACK]["all"] for one in results]
-        models.append(entry | {"share": [round((one - stay) / (expert - stay), 3) for one in earned]})
+                entry[when + memory] = returns[PREFERENCE + control][block]
+        share = (returns[TEAMMATE_TRACK]["all"] - stay) / (expert - stay)
+        runs.append(entry | {"share": round(share, 3)})
     content: dict[str, Any] = {
         "data_version": dataset.info.data_version,
         "training": {"steps": options.steps, "batch_size": options.batch_size, "context": options.context},
         "tasks": {name: len(tasks) for name, tasks in options.tasks.items()},
         "references": references[PREFERENCE],
-        "models": models,
     }
     before = parse_json(read_text(path)) if path.is_file() else {}
     if all(before.get(name) == content[name] for name in ("training", "tasks")):
-        new = {(one["histories"], one["learner"]) for one in models}
-        models += [one for one in before["models"] if (one["histories"], one["learner"]) not in new]
+        earlier = runs_on(dataset.index, before.get("runs", []))
+        runs = [*{tuple(one[name] for name in RUN_KEY): one for one in (*earlier, *runs)}.values()]
+    runs.sort(key=lambda one: [one[name] for name in RUN_KEY])
     with atomic_write(path) as partial:
-        write_json(partial, content)
+        write_json(partial, content | {"runs": runs})
     return path
 
 

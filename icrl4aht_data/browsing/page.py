@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import zlib
 from base64 import b64encode
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from html import escape
-from itertools import zip_longest
 from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
@@ -68,22 +68,27 @@ class EmbeddedHistory(NamedTuple):
 def varied_history_ids(dataset: Dataset, count: int) -> list[int]:
     """Return at most `count` history ids, ascending, spread over layouts, sources and teammate kinds.
 
-    Layouts take turns, and within a layout its sources and teammate kinds. The generated layouts of a family count as
-    one layout.
+    Layouts take turns. In its turn, a layout gives a history of the source, and of this source's teammate kind, of
+    which the fewest histories were chosen before. The generated layouts of a family count as one layout.
     """
-    groups: dict[str, dict[str, dict[tuple[str, ...], list[int]]]] = {}
+    groups: dict[str, dict[tuple[str, ...], list[int]]] = {}
     names = ("layout", "source", "teammate_family", "teammate_kind")
     columns = (dataset.column(name).tolist() for name in names)
-    for number, layout, source, *kind in zip(dataset.ids.tolist(), *columns, strict=True):
-        of_source = groups.setdefault(layout_title(layout), {}).setdefault(source, {})
-        of_source.setdefault(tuple(kind), []).append(number)
-    layouts = (_interleave(_interleave(kinds.values()) for kinds in layout.values()) for layout in groups.values())
-    return sorted(_interleave(layouts)[:count])
-
-
-def _interleave(lists: Iterable[list[int]]) -> list[int]:
-    """Interleave lists: return the first elements of all lists, then the second elements, and so on."""
-    return [number for turn in zip_longest(*lists) for number in turn if number is not None]
+    for number, layout, *kind in zip(dataset.ids.tolist(), *columns, strict=True):
+        groups.setdefault(layout_title(layout), {}).setdefault(tuple(kind), []).append(number)
+    chosen: list[int] = []
+    sources, kinds = Counter[str](), Counter[tuple[str, ...]]()
+    while groups and len(chosen) < count:
+        for layout, remaining in list(groups.items())[: count - len(chosen)]:
+            kind = min(remaining, key=lambda one: (sources[one[0]], kinds[one[1:]]))
+            chosen.append(remaining[kind].pop(0))
+            sources[kind[0]] += 1
+            kinds[kind[1:]] += 1
+            if not remaining[kind]:
+                del remaining[kind]
+            if not remaining:
+                del groups[layout]
+    return sorted(chosen)
 
 
 def evenly_spaced_episodes(episodes: int, most: int | None) -> np.ndarray:

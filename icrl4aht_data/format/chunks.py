@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -60,21 +60,35 @@ def read_table(path: Path) -> np.ndarray:
     return table
 
 
-def chunk_locations(open_dataset: Callable[[str], Any], kind: Kind, entry: Entry) -> list[tuple[int, int, int]]:
+def stored_chunks(dataset: Any) -> dict[tuple[int, ...], tuple[int, int]]:
+    """Return (offset, size) of each stored chunk of an HDF5 dataset, by the position of the chunk's first element."""
+    found: dict[tuple[int, ...], tuple[int, int]] = {}
+
+    def add(chunk: Any) -> None:
+        found[chunk.chunk_offset] = (chunk.byte_offset or 0, chunk.size)
+
+    dataset.id.chunk_iter(add)
+    return found
+
+
+def chunk_locations(
+    chunks_of: Callable[[str], Mapping[tuple[int, ...], tuple[int, int]]], kind: Kind, entry: Entry
+) -> list[tuple[int, int, int]]:
     """Return (offset, size, rows) of each chunk of a history, as reported by HDF5, in the order of the chunk table.
 
+    Offset and size of a chunk that is not stored are 0.
+
     Args:
-        open_dataset: function from the path of a dataset in the shard to the HDF5 dataset.
+        chunks_of: function from the path of a dataset in the shard to the dataset's `stored_chunks`.
         kind: kind of the release.
         entry: index entry of the history.
     """
     locations = []
     for field in entry.stored_fields(kind):
-        dataset = open_dataset(f"{entry.h5_group}/{field.name}")
-        for start in range(0, entry.rows(field), field.chunk):
+        stored, rows = chunks_of(f"{entry.h5_group}/{field.name}"), entry.rows(field)
+        for start in range(0, rows, field.chunk):
             position = (start,) if entry.h5_row is None else (entry.h5_row, start)
-            info = dataset.id.get_chunk_info_by_coord(position)
-            locations.append((info.byte_offset or 0, info.size, min(field.chunk, entry.rows(field) - start)))
+            locations.append((*stored.get(position, (0, 0)), min(field.chunk, rows - start)))
     return locations
 
 

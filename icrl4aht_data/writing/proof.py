@@ -19,6 +19,9 @@ from icrl4aht_data.utils.text import card_file, markdown_table
 
 PROOF_FILE = "proof.json"
 
+RUN_KEY = ("histories", "learner", "seed")
+"""Fields that identify a training run in the file."""
+
 _COLUMNS = {
     "first": "episode 1",
     "late": "episodes 6 to 20",
@@ -30,9 +33,9 @@ _COLUMNS = {
 
 
 def read_proof(root: Path) -> dict[str, Any] | None:
-    """Return the content of `cards/proof.json` with the models that were trained on histories of a release.
+    """Return the content of `cards/proof.json` with the training runs on histories of a release.
 
-    The result is None if there are no such models.
+    The result is None if there are no such runs.
 
     Args:
         root: folder of the release.
@@ -41,10 +44,14 @@ def read_proof(root: Path) -> dict[str, Any] | None:
         content = parse_json(read_text(card_file(PROOF_FILE)))
     except OptionError:  # the file has not been made yet
         return None
-    index = read_index(root)
-    hashes = {source: histories_hash(index, source) for source in {one["histories"] for one in content["models"]}}
-    models = [one for one in content["models"] if one["histories_sha256"] == hashes[one["histories"]]]
-    return content | {"models": models} if models else None
+    runs = runs_on(read_index(root), content["runs"])
+    return content | {"runs": runs} if runs else None
+
+
+def runs_on(index: Index, runs: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the training runs that learned from the histories of a release, as the release contains them now."""
+    hashes = {source: histories_hash(index, source) for source in {one["histories"] for one in runs}}
+    return [one for one in runs if one["histories_sha256"] == hashes[one["histories"]]]
 
 
 def histories_hash(index: Index, source: str) -> str:
@@ -64,9 +71,10 @@ def histories_hash(index: Index, source: str) -> str:
 
 def proof_table(proof: Mapping[str, Any]) -> str:
     """Return a Markdown table of models, their training histories, and their mean returns (range over runs)."""
+    models = grouped(proof["runs"], lambda one: (one["histories"], one["learner"]))
     rows = [
-        [one["histories"], one["learner"], str(len(one["seeds"])), *(_mean_text(one[key], key) for key in _COLUMNS)]
-        for one in proof["models"]
+        [*model, str(len(runs)), *(_mean_text([one[key] for one in runs], key) for key in _COLUMNS)]
+        for model, runs in models.items()
     ]
     return markdown_table(["histories", "model", "trainings", *_COLUMNS.values()], rows, right=1 + len(_COLUMNS))
 

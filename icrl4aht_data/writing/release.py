@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -44,12 +46,15 @@ from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.utils.groups import grouped
+from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_data.writing.card import write_card
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder
 from icrl4aht_data.writing.shard_writer import EncodedChunk, encode_history, write_shard
 
 SHARD_BYTES = 256 * 2**20
 """Intended size of a shard in bytes; sizes are estimated from the first history of each layout."""
+
+_ENCODED_AHEAD = 2  # number of histories in memory besides the one that is written
 
 
 @dataclass(frozen=True)
@@ -196,29 +201,41 @@ class _ShardWriter:
 
     def write(self, stem: str, tasks: list[NewTask]) -> None:
         """Write the histories of tasks that share track, layout and split into shards named `stem`-*.h5."""
-        histories = (history for new in tasks for history in self._load(new))
         total = sum(new.streams for new in tasks)
-        first = list(islice(histories, 1))
-        size = sum(len(chunk.data) for _, chunks in first for chunk in chunks)
-        shards = max(1, -(-total // self.shard_histories), min(total, round(total * size / SHARD_BYTES)))
-        histories = chain(first, histories)
-        for number in range(shards):
-            part = list(islice(histories, total * (number + 1) // shards - total * number // shards))
-            name = f"{stem}-{number:05}-of-{shards:05}.h5"
-            entries = self._with_positions([entry for entry, _ in part], name)
-            write_shard(self.root, name, self.kind, entries, [chunks for _, chunks in part])
-            self.entries += entries
-        for _ in histories:  # finish the generator, so `_load` checks and reports the last task
-            pass
+        with ThreadPoolExecutor(usable_cores()) as pool:
+            histories = self._encode(tasks, pool)
+            first = list(islice(histories, 1))
+            size = sum(len(chunk.data) for _, chunks in first for chunk in chunks)
+            shards = max(1, -(-total // self.shard_histories), min(total, round(total * size / SHARD_BYTES)))
+            histories = chain(first, histories)
+            for number in range(shards):
+                part = list(islice(histories, total * (number + 1) // shards - total * number // shards))
+                name = f"{stem}-{number:05}-of-{shards:05}.h5"
+                entries = self._with_positions([entry for entry, _ in part], name)
+                write_shard(self.root, name, self.kind, entries, [chunks for _, chunks in part])
+                self.entries += entries
+            for _ in histories:  # finish the generator, so `_load` checks and reports the last task
+                pass
 
-    def _load(self, new: NewTask) -> Iterator[tuple[Entry, list[EncodedChunk]]]:
-        """Yield the index entry and the chunks of each history of a task, with one history in memory at a time."""
+    def _encode(self, tasks: list[NewTask], pool: Executor) -> Iterator[tuple[Entry, list[EncodedChunk]]]:
+        """Yield the index entry and the chunks of each history of tasks, while threads encode the next histories."""
+        waiting: deque[tuple[Entry, Callable[[], list[EncodedChunk]]]] = deque()
+        for history in chain.from_iterable(self._load(new, pool) for new in tasks):
+            waiting.append(history)
+            if len(waiting) > _ENCODED_AHEAD:
+                entry, chunks = waiting.popleft()
+                yield entry, chunks()
+        for entry, chunks in waiting:
+            yield entry, chunks()
+
+    def _load(self, new: NewTask, pool: Executor) -> Iterator[tuple[Entry, Callable[[], list[EncodedChunk]]]]:
+        """Yield the index entry of each history of a task, and a function that waits for the history's chunks."""
         given = 0
         for history in new.load():
             entry, arrays = self._entry(new, history), history.arrays
             if self.kind == "full":
                 arrays = {**arrays, "obs": observe(new.task.layout, arrays["state"], EGO)}
-            yield entry, encode_history(self.kind, entry, arrays)
+            yield entry, encode_history(pool, self.kind, entry, arrays)
             given += 1
         if given != new.streams:
             raise OptionError(f"task {new.task.task_id}: expected {new.streams} histories, found {given}")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from functools import cache
 from io import BytesIO
 from pathlib import Path
@@ -21,11 +21,11 @@ from icrl4aht_data.format.chunks import (
     chunk_locations,
     chunk_table_name,
     encode_chunk,
+    stored_chunks,
 )
 from icrl4aht_data.format.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.files import add_filename
-from icrl4aht_data.utils.system import usable_cores
 
 _BLOCK = 2000  # number of steps in one chunk of scalars, or in two chunks of state records
 
@@ -71,7 +71,8 @@ def write_shard(
             for field, start, data in sorted(chunks, key=lambda chunk: chunk_sort_key(chunk.field, chunk.start)):
                 position = (start,) if entry.h5_row is None else (entry.h5_row, start)
                 open_dataset(f"{entry.h5_group}/{field.name}").id.write_direct_chunk(position, data)
-        locations = [row for entry in entries for row in chunk_locations(open_dataset, kind, entry)]
+        chunks_of = cache(lambda name: stored_chunks(open_dataset(name)))
+        locations = [row for entry in entries for row in chunk_locations(chunks_of, kind, entry)]
         stored = [chunk.data for chunks in histories for chunk in chunks]
         rows = [(*row, *_checksums(data)) for row, data in zip(locations, stored, strict=True)]
         table = np.array(rows, CHUNK_DTYPE)
@@ -135,29 +136,34 @@ def chunk_sort_key(field: Field, start: int) -> tuple[int, ...]:
     return (0, start // _BLOCK, -1 if leads else order.index(field.name), start)
 
 
-def encode_history(kind: Kind, entry: Entry, arrays: Mapping[str, np.ndarray]) -> list[EncodedChunk]:
-    """Encode all chunks of a history, in the order of the chunk table.
+def encode_history(
+    pool: Executor, kind: Kind, entry: Entry, arrays: Mapping[str, np.ndarray]
+) -> Callable[[], list[EncodedChunk]]:
+    """Start to encode all chunks of a history in the threads of a pool.
 
     Args:
+        pool: threads that encode the chunks.
         kind: kind of the release.
         entry: the history's index entry.
         arrays: arrays by field name, of any dtype; the stored dtype must be able to represent all values.
+
+    Returns:
+        A function that waits for the chunks, and returns them in the order of the chunk table.
 
     Raises:
         OptionError: if the stored dtype cannot represent a value, or an array's length differs from the index entry.
     """
     layout, parts = get_layout(entry.layout), []
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        for field in entry.stored_fields(kind):
-            element, array, rows = field.element(layout, kind), arrays[field.name], entry.rows(field)
-            where = f"task {entry.task_id}, stream {entry.env_idx}: field {field.name}"
-            if len(array) != rows:
-                raise OptionError(f"{where}: expected {rows} rows, found {len(array)}")
-            stored = np.ascontiguousarray(array, element.base)
-            if not np.array_equal(stored, array):
-                raise OptionError(f"{where} has values that {element.base} cannot represent")
-            length = min(field.chunk, rows)
-            for start in range(0, rows, length):
-                data = pool.submit(encode_chunk, stored[start : start + length], length, element.itemsize)
-                parts.append((field, start, data))
-    return [EncodedChunk(field, start, data.result()) for field, start, data in parts]
+    for field in entry.stored_fields(kind):
+        element, array, rows = field.element(layout, kind), arrays[field.name], entry.rows(field)
+        where = f"task {entry.task_id}, stream {entry.env_idx}: field {field.name}"
+        if len(array) != rows:
+            raise OptionError(f"{where}: expected {rows} rows, found {len(array)}")
+        stored = np.ascontiguousarray(array, element.base)
+        if not np.array_equal(stored, array):
+            raise OptionError(f"{where} has values that {element.base} cannot represent")
+        length = min(field.chunk, rows)
+        for start in range(0, rows, length):
+            data = pool.submit(encode_chunk, stored[start : start + length], length, element.itemsize)
+            parts.append((field, start, data))
+    return lambda: [EncodedChunk(field, start, data.result()) for field, start, data in parts]

@@ -37,63 +37,70 @@ def block_returns(first: float, late: float, cleared: float, teammate: float) ->
     return blocks | {"teammate": {"all": teammate}}
 
 
-def content_of(job: ProofJob, late: float) -> dict[str, Any]:
-    """Return the result of a finished job, for its file."""
-    return {"settings": job.settings, "minutes": 20.0, "returns": block_returns(-2.0, late, -1.0, late / 2)}
+def finish(job: ProofJob, late: float) -> ProofJob:
+    """Write the result of a job, as if it had finished."""
+    job.folder.mkdir(exist_ok=True)
+    returns = block_returns(-2.0, late, -1.0, late / 2)
+    job.result_file.write_text(json.dumps({"settings": job.settings, "minutes": 20.0, "returns": returns}))
+    return job
 
 
-def test_proof_table_has_mean_and_range_over_finished_training_runs(release, tmp_path):
-    options = small_options(release)
-    jobs = [ProofJob("all", "ad-expert", seed, options, tmp_path) for seed in (0, 1, 2)]
-    for job, late in zip(jobs[:2], (10.0, 20.0), strict=True):  # the third job stays unfinished
-        job.folder.mkdir()
-        job.result_file.write_text(json.dumps(content_of(job, late)))
-    assert [job.is_finished() for job in jobs] == [True, True, False]
+def test_proof_has_an_entry_for_each_training_run_and_keeps_comparable_ones(release, tmp_path):
+    options, path = small_options(release), tmp_path / "proof.json"
     blocks = {"1": 0.0, "6-20": 40.0}
     earned = {
         "preference": {"stay": blocks, "search": blocks},
         "teammate": {"stay": {"all": 0.0}, "rl2-reference": {"all": 20.0}},
     }
-    path = write_proof(jobs, earned, tmp_path / "proof.json")
-    content = json.loads(path.read_text())
-    assert content["models"][0]["histories_sha256"] == histories_hash(read_index(release), "all")
-    assert content["models"][0]["share"] == [0.25, 0.5]  # the models earn 5 and 10, and rl2-reference earns 20
-    other = ProofJob("all", "ad", 0, options, tmp_path)
-    other.folder.mkdir()
-    other.result_file.write_text(json.dumps(content_of(other, 0.0)))
-    write_proof([other], earned, path)
-    assert [one["learner"] for one in json.loads(path.read_text())["models"]] == [
-        "AD, own actions",
-        "AD, expert labels",
+
+    def written(*jobs: ProofJob) -> list[dict[str, Any]]:
+        write_proof(jobs, earned, path)
+        return json.loads(path.read_text())["runs"]
+
+    unfinished = ProofJob("all", "ad-expert", 2, options, tmp_path)
+    first, second = (finish(ProofJob("all", "ad-expert", s, options, tmp_path), 10.0 * (s + 1)) for s in (0, 1))
+    assert not unfinished.is_finished()
+    (run,) = written(second, unfinished)
+    assert run["histories_sha256"] == histories_hash(read_index(release), "all")
+    assert run["share"] == 0.5  # the model earns 10, and rl2-reference earns 20
+    assert [one["seed"] for one in written(first)] == [0, 1]
+    own = finish(ProofJob("all", "ad", 0, options, tmp_path), 0.0)
+    assert [(one["learner"], one["seed"]) for one in written(own, first)] == [
+        ("AD, expert labels", 0),
+        ("AD, expert labels", 1),
+        ("AD, own actions", 0),
     ]
-    changed = replace(other, options=replace(options, steps=3))
-    changed.result_file.write_text(json.dumps(content_of(changed, 0.0)))
-    write_proof([changed], earned, path)
-    assert len(json.loads(path.read_text())["models"]) == 1, "the settings of the earlier models differ"
     spreads = ["-2.0 (-2.0 to -2.0)", "15.0 (10.0 to 20.0)", "-2.0 (-2.0 to -2.0)", "-1.0 (-1.0 to -1.0)"]
     spreads += ["0.38 (0.25 to 0.50)", "20.0 (20.0 to 20.0)"]
-    assert " | ".join(["| all | AD, expert labels | 2", *spreads]) in proof_table(content)
+    assert " | ".join(["| all | AD, expert labels | 2", *spreads]) in proof_table(json.loads(path.read_text()))
+
+    content = json.loads(path.read_text())
+    content["runs"][0]["histories_sha256"] = "0"
+    path.write_text(json.dumps(content))
+    assert len(written(own)) == 2, "an entry of other histories is removed"
+    changed = finish(replace(own, options=replace(options, steps=3)), 0.0)
+    assert len(written(changed)) == 1, "the settings of the earlier runs differ"
 
 
 def test_dataset_card_shows_only_results_of_models_trained_on_its_release(release, tmp_path, monkeypatch):
-    model = {key: [1.0] for key in ("first", "late", "first_cleared", "late_cleared", "share", "minutes")}
-    model |= {"histories": "ppo", "learner": "AD", "seeds": [0]}
-    model |= {"histories_sha256": histories_hash(read_index(release), "ppo")}
+    run = dict.fromkeys(("first", "late", "first_cleared", "late_cleared", "share", "minutes"), 1.0)
+    run |= {"histories": "ppo", "learner": "AD", "seed": 0}
+    run |= {"histories_sha256": histories_hash(read_index(release), "ppo")}
     content = {
         "training": {"steps": 800, "batch_size": 16, "context": 500},
         "tasks": {"preference": 48, "teammate": 20},
         "references": {"stay": {"6-20": 1.0}, "search": {"1": 2.0, "6-20": 40.0}},
-        "models": [model],
+        "runs": [run],
     }
     stored = tmp_path / "proof.json"
     monkeypatch.setattr(proof, "card_file", lambda name: stored)
     stored.write_text(json.dumps(content))
     assert read_proof(release) == content
     assert "## What it teaches" in render_card(card_facts(release))
-    other = model | {"histories_sha256": "0"}
-    stored.write_text(json.dumps(content | {"models": [other, model]}))
+    other = run | {"histories_sha256": "0"}
+    stored.write_text(json.dumps(content | {"runs": [other, run]}))
     assert read_proof(release) == content
-    stored.write_text(json.dumps(content | {"models": [other]}))
+    stored.write_text(json.dumps(content | {"runs": [other]}))
     assert read_proof(release) is None
     assert "## What it teaches" not in render_card(card_facts(release))
 

@@ -149,9 +149,10 @@ def adaptation_headroom() -> tuple[float, ...]:
 def proof_returns() -> tuple[float, ...]:
     """Return the number of tasks, and returns of AD on `search` histories in episodes 1 and 6 to 20, also cleared."""
     proof = json.loads((ROOT / "cards" / "proof.json").read_text(encoding="utf-8"))
-    (model,) = [one for one in proof["models"] if (one["histories"], one["learner"]) == ("search", "AD, expert labels")]
-    assert len(model["seeds"]) == 3
-    return proof["tasks"]["preference"], *(fmean(model[name]) for name in ("first", "late", "late_cleared"))
+    runs = [one for one in proof["runs"] if (one["histories"], one["learner"]) == ("search", "AD, expert labels")]
+    assert len(runs) == 3
+    means = [fmean(one[name] for one in runs) for name in ("first", "late", "late_cleared")]
+    return proof["tasks"]["preference"], *means
 
 
 def training_teammates_like_tests() -> tuple[int, ...]:
