@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
+from importlib import import_module
 
 import nbformat
 import pytest
@@ -41,6 +43,17 @@ def test_files_linked_from_notebooks_exist(path):
     text = "\n".join(cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "markdown")
     for target in re.findall(r"\]\((.*?)\)", text):
         assert (path.parent / target).is_file(), target
+
+
+@EVERY_NOTEBOOK
+def test_names_that_notebooks_import_exist(path):
+    cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    code = "\n".join(line for text in cells if text[:2] != "%%" for line in text.splitlines() if line[:1] not in "%!")
+    imports = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.ImportFrom)]
+    own = [(node.module, alias.name) for node in imports for alias in node.names if str(node.module)[:8] == "icrl4aht"]
+    assert own
+    for module, name in own:
+        assert hasattr(import_module(str(module)), name), f"{module} has no {name}"
 
 
 @pytest.mark.slow
