@@ -365,13 +365,13 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
     """
     path = folder / MANIFEST
 
-    def has_manifest() -> bool:
+    def has_same_manifest() -> bool:
         return path.is_file() and path.stat().st_size == len(text) and path.read_bytes() == text
 
-    if has_manifest():
+    if has_same_manifest():
         return
     with disk.process_lock(disk.lock_file_path(folder)):  # another process may be writing the manifest
-        if has_manifest():
+        if has_same_manifest():
             return
         if folder.exists() and any(folder.iterdir()) and not is_ours:
             raise OptionError(f"{folder}: not empty, and not this version of {url}; give a new or an empty folder")

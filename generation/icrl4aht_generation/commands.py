@@ -237,8 +237,8 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
 def check(a: Path, b: Path, as_json: bool) -> None:
     """Compare two generated releases bit for bit.
 
-    A and B are releases, artefacts, or output folders of `generate`. Prints the differences, and exits with 1 if any
-    file differs. Writes nothing.
+    A and B are releases, or other folders that `generate` wrote. Prints the differences, and exits with 1 if there are
+    any. Logs of timing and of failures are not compared. Writes nothing.
     """
     from icrl4aht_generation.releases.check import compare_rebuilds
 
@@ -260,11 +260,12 @@ def check(a: Path, b: Path, as_json: bool) -> None:
 )
 @overwrite_option
 def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
-    """Write the package's manifests with sampled teammates.
+    """Write the package's manifests of tasks.
 
-    Writes TRACK_validation.jsonl, TRACK_diverse_train.jsonl and TRACK_diverse_validation.jsonl with the teammates that
-    `draws` sampled and measured, and the manifests of the track `preference`. An existing file with other tasks is only
-    replaced with --overwrite. TRACK_test.jsonl contains the published tasks, and this command does not write it.
+    For the tracks `teammate` and `layout`, writes TRACK_validation.jsonl, TRACK_diverse_train.jsonl and
+    TRACK_diverse_validation.jsonl with the teammates that `research draws` sampled and measured; for the track
+    `preference`, all three manifests. The published tasks of the other tracks are not written. An existing file with
+    other tasks is only replaced with --overwrite.
     """
     from icrl4aht_generation.teammates.draws import diverse_tasks, validation_tasks
     from icrl4aht_generation.teammates.preference import preference_tasks

@@ -12,7 +12,7 @@ VERBS = (
     Verb("plan", f"{_CLI}:plan", "Generate", "Estimate the cost of generating a release."),
     Verb("check", f"{_CLI}:check", "Generate", "Compare two generated releases bit for bit."),
     Verb("research draws", f"{_CLI}:draws", _TASKS, "Sample heuristic teammates for tasks, and measure them."),
-    Verb("research manifests", f"{_CLI}:manifests", _TASKS, "Write the package's manifests with sampled teammates."),
+    Verb("research manifests", f"{_CLI}:manifests", _TASKS, "Write the package's manifests of tasks."),
     Verb(
         "research diversity", f"{_CLI}:diversity", _TASKS, "Report how much a suite's or a release's teammates differ."
     ),

@@ -42,7 +42,7 @@ def cacheable_bytes() -> int:
 
 
 def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> dict[str, np.ndarray]:
-    """Return the cached arrays of a key, memory-mapped and read-only; build the arrays first if they are missing.
+    """Return the set of cached arrays of a key, memory-mapped and read-only; build a missing or damaged set first.
 
     The least recently used sets are removed if the cache would exceed its limit or fill the disk. Processes that have
     mapped a removed set can still read the set.

@@ -93,7 +93,7 @@ class History(FieldArrays):
 
         Raises:
             UnknownNameError: for a name that is not a field.
-            OptionError: if `start` or `stop` is not an integer.
+            OptionError: if `start` or `stop` is neither an integer nor None.
             LabelsMissingError: if the history does not have the expert, oracle or teammate actions asked for.
             NotStoredError: for states of a release without state records.
             ShardCorruptError: if the checksum of a chunk is wrong; the message names the chunk.
@@ -104,7 +104,7 @@ class History(FieldArrays):
                 raise TypeError
             start, stop, _ = slice(start, stop).indices(self.entry.rows(field))
         except TypeError as error:
-            raise OptionError(f"rows {start!r} to {stop!r} of {name}: expected integers, as in a slice") from error
+            raise OptionError(f"{name}[{start!r}:{stop!r}]: expected integers or None") from error
         stop = max(start, stop)
         if self.kind in field.absent:
             return self._render_rows(start, stop, np.uint8, canonical=False)

@@ -113,13 +113,13 @@ def agent_names() -> tuple[str, ...]:
 def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool | None = None) -> NamedEgo:
     """Return a reference ego, a bundled model, or the trained model in a run folder of `icrl4aht-data train`.
 
-    On each layout, a bundled model uses the parameters for the layout's track, or its parameters for all tracks.
+    A bundled model has one set of parameters for all tracks, or one set for each track.
 
     Args:
         name: name of a reference ego or of a bundled model, or path of a run folder.
         acting: how a trained model computes its context, see `ACTING`; "cached" by default.
-        greedy: True if a trained model takes its most probable action, False if it samples an action; by default as in
-            the model's stored results.
+        greedy: True if a trained model takes its most probable action, False if it samples an action; by default True
+            for a run folder, and as in the stored results for a bundled model.
 
     Raises:
         UnknownNameError: if the name or the value of `acting` is unknown.

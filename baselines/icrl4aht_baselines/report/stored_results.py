@@ -100,7 +100,9 @@ def write_stored(path: Path, stored: StoredResults) -> None:
     for file, frame, digits in zip(_table_paths(path), (stored.table, stored.curves), (3, 2), strict=True):
         with atomic_write(file) as partial:
             text = frame.round(digits).to_csv(index=False, lineterminator="\n")
-            partial.write_bytes(lzma.compress(text.encode(), preset=lzma.PRESET_EXTREME | 9))  # half of gzip's size
+            partial.write_bytes(
+                lzma.compress(text.encode(), preset=lzma.PRESET_EXTREME | 9)
+            )  # half the size of gzip's output
     with atomic_write(path) as partial:
         write_json(partial, msgspec.to_builtins(stored.agents))
 
@@ -154,7 +156,7 @@ def add_submission(stored: StoredResults, found: Submission, where: str = "submi
         run = as_run([Result(task, one.settings, returns) for task, returns in one.returns.items()], found.agent, tasks)
         tables.append(run.table.assign(agent=found.agent, training=one.training, control=one.control))
         for cell, returns in run.cells.items():
-            if cell.layout in TEST_LAYOUTS:  # the figure has no other layouts
+            if cell.layout in TEST_LAYOUTS:  # `plot_comparison` draws no others
                 curves[one.control, cell.layout].append(returns)
     rows = [
         (found.agent, SUBMITTED_PROTOCOL, control, layout, episode, value)

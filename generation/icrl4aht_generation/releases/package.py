@@ -294,7 +294,7 @@ def _script_label_record(source: str, references: ReferenceEgos) -> ExpertLabels
 
 
 def _label_function(found: TaskHistories, labeller: Path | None) -> Callable[[int, np.ndarray], np.ndarray]:
-    """Return a function of a stream's number and states, uint8 of shape (T, S), that returns T expert actions, int8."""
+    """Return a function from a stream's number and states, uint8 (T, S), to expert actions, int8 (T,)."""
     if labeller is None:
         script = np.load(found.folders[0] / "script_actions.npy", mmap_mode="r")
         return lambda stream, states: script[stream]

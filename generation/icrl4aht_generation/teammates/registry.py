@@ -119,8 +119,8 @@ def build_teammate(
     """Return the policy of a task's teammate entry; learned teammates act greedily.
 
     Args:
-        layout: layout of the state records or observations that the teammate sees; None for a heuristic that sees a
-            `Situation`, and can play every layout.
+        layout: layout of the state records or observations that the teammate sees; None makes a heuristic that sees a
+            `Situation` and can play on any layout.
         teammate: a heuristic's parameters, or a checkpoint; see `icrl4aht_data.benchmark.tasks.Task`.
         slot: 0 or 1, the agent that the teammate plays.
         noise: source of a heuristic's randomness, see `icrl4aht_generation.policy.Noise`.

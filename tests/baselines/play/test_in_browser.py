@@ -69,7 +69,7 @@ def serve(session: PlaySession) -> Iterator[str]:
 
 @contextmanager
 def serve_recorded(folder: Path, *words: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """Record a game that the command `play` serves; yield the address of the page and the server process."""
+    """Run the command `play --record`; yield the address of its page and the server process."""
     words = (*words, *f"--layout {LAYOUT.name} --with H2/t3 --ticks 0 --port 0 --seed 3 --record {folder}".split())
     command = [sys.executable, "-u", "-m", "icrl4aht_data", "play", *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:

@@ -87,7 +87,7 @@ def play_oracle_actions(player: Browser, episodes: int, steps: int) -> None:
 
 
 def test_recorded_game_is_a_valid_release(tmp_path):
-    """The record is a valid release with the person's pseudonym, which is written only after consent."""
+    """The record is a valid release with the person's pseudonym. Nothing is written before consent."""
     session = new_session("H2/t3", episodes=2, steps=100, record=tmp_path / "record")
     with make_client(session) as client, open_browser(client) as player:
         assert "Nothing else is stored" in player.setup["consent"]

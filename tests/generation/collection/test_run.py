@@ -45,7 +45,7 @@ def damaged_partial(profile, built, tmp_path) -> Path:
     return partial
 
 
-def test_job_waits_for_a_process_that_collects_its_task(built, tmp_path):
+def test_job_does_not_repeat_a_task_that_another_process_collected(built, tmp_path):
     """The job does not collect the task again if the other process has finished it."""
     profile = load_profile(str(built / "tiny.toml"))
     (work,) = profile.units()

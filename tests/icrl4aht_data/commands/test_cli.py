@@ -159,7 +159,7 @@ def test_commands_do_not_overwrite_existing_data(lite, full, tmp_path):
 
 @pytest.mark.parametrize(("arguments", "code"), [(["list"], 0), (["show", "--json"], 0), (["list", "--nope"], 2)])
 def test_commands_run_without_stdout(lite, monkeypatch, arguments, code):
-    """Regression: the shell command `list >&-` failed with an AttributeError."""
+    """Regression: with closed stdout, `list` failed with an AttributeError."""
     monkeypatch.setattr(sys, "argv", ["icrl4aht-data", *arguments, str(lite[0])])
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, None)

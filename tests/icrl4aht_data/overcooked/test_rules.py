@@ -128,7 +128,7 @@ def test_pot_with_three_ingredients_cooks_for_20_steps(slot):
     for content in (ZERO, 2 * ZERO):
         after = interact(slot, record)
         assert (after.pots, after.hands) == ([(content, 0)], [0, 0])
-        assert act(CRAMPED, after.record, STAY).pots == [(content, 0)]  # two ingredients do not start cooking
+        assert act(CRAMPED, after.record, STAY).pots == [(content, 0)]  # one or two do not start cooking
         record = after.record.copy()
         record[:, columns(CRAMPED).hands.start + slot] = ZERO
     after = interact(slot, record)

@@ -49,7 +49,7 @@ WRONG_CALLS: dict[str, Any] = {
     r"root = 'a\\x00b': expected a release folder": lambda ds: load_icrl4aht("a\0b"),
     "root = 7: expected a release folder": lambda ds: verify_release(7),  # type: ignore[arg-type]
     r"unknown layout \['a'\]": lambda ds: get_layout(["a"]),  # type: ignore[arg-type]
-    "rows True to None of actions: expected integers": lambda ds: ds[0].read("actions", True),
+    r"actions\[True:None\]: expected integers or None": lambda ds: ds[0].read("actions", True),
     "state = 5: expected": lambda ds: ds.ad(**SIZES).batches().load_state_dict(5),  # type: ignore[arg-type]
     "unknown context 'x'; valid: spawn": lambda ds: torch_loader(ds.ad(**SIZES), workers=1, context="x"),
     "state: expected bytes": lambda ds: render_observations({"layout": ["demo_wide"], "state": [[[300]]]}),

@@ -160,7 +160,7 @@ def draw(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, " 4"]]:
 
 def split_key_again(key: Key[Array, ""], where: Bool[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""]]:
     """Return a teammate's next random key, split once more if `where` is true, and a key for additional draws."""
-    # The published code draws these numbers in some states only. Selecting a key gives the same chain of keys without a
-    # branch, which `jax.vmap` would compute anyway.
+    # The published code draws these numbers in some states only. Selecting a key gives the same keys; with a branch,
+    # `jax.vmap` would compute both cases anyway.
     following, own = jax.random.split(key)
     return jnp.where(where, following, key), own
