@@ -81,6 +81,12 @@ def _remove_unfinished_entries(folder: Path) -> None:
                 entry.unlink()
 
 
+def pytest_collection_finish() -> None:
+    """Exempt all modules and tests from garbage collection, which tracing would otherwise start again and again."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the slowest test files first, so that all workers finish at about the same time."""
     order = {f"test_{name}.py": place for place, name in enumerate(COSTLIEST.split())}

@@ -27,7 +27,7 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_task
 
 from icrl4aht_data.errors import OptionError, UnknownNameError
-from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.commands import run_cli
 from tests.helpers.host_agents import HostRecorder
@@ -75,9 +75,10 @@ def test_model_is_evaluated_on_a_layout_without_training_data(trained_run, tmp_p
     assert "| cramped_down | `" in card and ", manifest with SHA-256 `" in card
 
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_jax_egos_receive_canonical_channels_on_every_layout(layout):
+@pytest.mark.parametrize("name", ["coord_ring", "test_wide", "cramped_down"])
+def test_jax_egos_receive_canonical_channels(name):
     """The policy returns its input instead of an action, so the test can compare observations."""
+    layout = get_layout(name)
     shown = Policy((), lambda params, key: (), lambda params, memory, ego_input, key: (ego_input, memory), "ego_input")
     (record,), key = random_records(layout, 1, np.random.default_rng(4)), jax.random.split(jax.random.key(0), 1)
     zero = jnp.zeros(1, jnp.int32)

@@ -132,7 +132,7 @@ def test_protocol_swap_keeps_ego_memory_and_random_keys(solo_returns, compiled_p
     assert first.returns[0][:2] == [stays[0, 0], wanders[0, 1]]
     assert second.returns[0] == [40, 40, 0, 0]  # a reward in the first episode makes the ego stay
     other = dataclasses.replace(H1, teammate=H4.teammate)
-    (expected,) = evaluate("fixed", ego(RANDOM), [other], FOUR)
+    (expected,) = evaluate("fixed", ego(RANDOM), [other], FOUR, programs=compiled_programs)
     assert first.returns[0][2:] == expected.returns[0][2:]
     assert (first.partners, second.partners) == ([H1.task_id, H4.task_id], [H4.task_id, H1.task_id])
 

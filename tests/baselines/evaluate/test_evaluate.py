@@ -14,7 +14,7 @@ import pytest
 from icrl4aht_baselines.agents.egos import random, stay
 from icrl4aht_baselines.agents.host import EgoInput, from_host
 from icrl4aht_baselines.evaluate import evaluator
-from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
+from icrl4aht_baselines.evaluate.evaluator import ProgramCache, evaluate, play_tasks
 from icrl4aht_baselines.evaluate.protocols import (
     PROTOCOLS,
     bundled_tasks,
@@ -46,21 +46,27 @@ def returns_by_task(results):
 
 
 @pytest.fixture(scope="module")
-def batch_returns():
+def programs():
+    """Return a cache of the programs that tests of this file compile."""
+    return ProgramCache()
+
+
+@pytest.fixture(scope="module")
+def batch_returns(programs):
     """Return the returns of ten tasks that are evaluated in one batch."""
-    return returns_by_task(evaluate("random", random, SIMPLE + RING, PUBLISHED))
+    return returns_by_task(evaluate("random", random, SIMPLE + RING, PUBLISHED, programs=programs))
 
 
-def test_returns_of_a_task_do_not_depend_on_other_tasks_in_batch(batch_returns):
+def test_returns_of_a_task_do_not_depend_on_other_tasks_in_batch(batch_returns, programs):
     alone = returns_by_task(evaluate("random", random, [RING[3]], PUBLISHED))
     assert alone[RING[3].task_id] == batch_returns[RING[3].task_id]
-    assert returns_by_task(evaluate("random", random, RING[::-1], PUBLISHED)) == {
+    assert returns_by_task(evaluate("random", random, RING[::-1], PUBLISHED, programs=programs)) == {
         task.task_id: batch_returns[task.task_id] for task in RING
     }
 
 
-def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_returns, tmp_path, monkeypatch):
-    first = evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
+def test_resumed_evaluation_skips_stored_tasks_and_gives_same_returns(batch_returns, programs, tmp_path, monkeypatch):
+    first = evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path, programs=programs)
     started, played = [], []
 
     def log_and_make_ego(layout):

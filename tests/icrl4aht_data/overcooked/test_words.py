@@ -34,7 +34,14 @@ def test_channels_of_words_equal_the_observation(layout, agent):
     ids = words.ids(records, agent=agent)
     assert ids.dtype == np.int32
     np.testing.assert_array_equal(words.channels[ids].reshape(expected.shape), expected)
-    np.testing.assert_array_equal(jax.jit(partial(words.ids, agent=agent))(records), ids)
+
+
+@pytest.mark.parametrize("layout", [LAYOUTS["test_wide"], LAYOUTS["cramped_up"]])
+def test_compiled_words_equal_those_of_numpy(layout):
+    """Words of agent 1; those of agent 0 are compiled for all layouts at once, see below."""
+    records, words = example_records(layout), cell_words((layout,))
+    compiled = jax.jit(partial(words.ids, agent=1))
+    np.testing.assert_array_equal(compiled(records), words.ids(records, agent=1))
 
 
 @each_layout
