@@ -24,9 +24,8 @@ RUN_KEY = ("histories", "learner", "seed")
 
 _COLUMNS = {
     "first": "episode 1",
-    "late": "episodes 6 to 20",
-    "first_cleared": "episode 1, cleared",
-    "late_cleared": "episodes 6 to 20, cleared",
+    "late": "episodes 6-20",
+    "late_cleared": "6-20, cleared",
     "share": "teammate track",
     "minutes": "minutes",
 }
@@ -70,7 +69,10 @@ def histories_hash(index: Index, source: str) -> str:
 
 
 def proof_table(proof: Mapping[str, Any]) -> str:
-    """Return a Markdown table of models, their training histories, and their mean returns (range over runs)."""
+    """Return a Markdown table of models, their training histories, and their mean returns (lowest..highest run).
+
+    In the first episode the memory is empty, so clearing it changes nothing.
+    """
     models = grouped(proof["runs"], lambda one: (one["histories"], one["learner"]))
     rows = [
         [*model, str(len(runs)), *(_mean_text([one[key] for one in runs], key) for key in _COLUMNS)]
@@ -81,5 +83,5 @@ def proof_table(proof: Mapping[str, Any]) -> str:
 
 def _mean_text(values: Sequence[float], key: str) -> str:
     digits = 2 if key == "share" else 1
-    ends = f" ({min(values):z.{digits}f} to {max(values):z.{digits}f})" if len(values) > 1 else ""
+    ends = f" ({min(values):z.{digits}f}..{max(values):z.{digits}f})" if len(values) > 1 else ""
     return f"{sum(values) / len(values):z.{digits}f}{ends}"

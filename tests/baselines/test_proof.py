@@ -70,8 +70,7 @@ def test_proof_has_an_entry_for_each_training_run_and_keeps_comparable_ones(rele
         ("AD, expert labels", 1),
         ("AD, own actions", 0),
     ]
-    spreads = ["-2.0 (-2.0 to -2.0)", "15.0 (10.0 to 20.0)", "-2.0 (-2.0 to -2.0)", "-1.0 (-1.0 to -1.0)"]
-    spreads += ["0.38 (0.25 to 0.50)", "20.0 (20.0 to 20.0)"]
+    spreads = ["-2.0 (-2.0..-2.0)", "15.0 (10.0..20.0)", "-1.0 (-1.0..-1.0)", "0.38 (0.25..0.50)", "20.0 (20.0..20.0)"]
     assert " | ".join(["| all | AD, expert labels | 2", *spreads]) in proof_table(json.loads(path.read_text()))
 
     content = json.loads(path.read_text())

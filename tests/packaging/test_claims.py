@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable
 from functools import cache
 from statistics import fmean
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 from icrl4aht_baselines import reference
@@ -146,13 +146,28 @@ def adaptation_headroom() -> tuple[float, ...]:
     return min(of[0]), max(of[0]), len(of[0]), min(of[1]), max(of[1]), len(of[1])
 
 
-def proof_returns() -> tuple[float, ...]:
-    """Return the number of tasks, and returns of AD on `search` histories in episodes 1 and 6 to 20, also cleared."""
-    proof = json.loads((ROOT / "cards" / "proof.json").read_text(encoding="utf-8"))
-    runs = [one for one in proof["runs"] if (one["histories"], one["learner"]) == ("search", "AD, expert labels")]
+@cache
+def read_stored_proof() -> dict[str, Any]:
+    return json.loads((ROOT / "cards" / "proof.json").read_text(encoding="utf-8"))
+
+
+def proof_mean(histories: str, learner: str, name: str) -> float:
+    """Return the mean of a value over the three training runs of a model in the proof of the bundled release."""
+    runs = [one for one in read_stored_proof()["runs"] if (one["histories"], one["learner"]) == (histories, learner)]
     assert len(runs) == 3
-    means = [fmean(one[name] for one in runs) for name in ("first", "late", "late_cleared")]
-    return proof["tasks"]["preference"], *means
+    return fmean(one[name] for one in runs)
+
+
+def search_proof() -> tuple[float, ...]:
+    """Return the number of tasks, and returns of AD on `search` histories in episodes 1 and 6 to 20, also cleared."""
+    return read_stored_proof()["tasks"]["preference"], *(
+        proof_mean("search", "AD, expert labels", name) for name in ("first", "late", "late_cleared")
+    )
+
+
+def agent_proof() -> tuple[float, float]:
+    """Return the shares that AD on `agent` histories earns with `expert` labels, and with own actions."""
+    return proof_mean("agent", "AD, expert labels", "share"), proof_mean("agent", "AD, own actions", "share")
 
 
 def training_teammates_like_tests() -> tuple[int, ...]:
@@ -203,7 +218,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     (
         "docs/preference",
         "return on the {} validation .. was {} in episode 1 and {} in .. and {} in these",
-        proof_returns,
+        search_proof,
     ),
     (
         "docs/preference",
@@ -213,6 +228,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/index", "{} test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/adapters", "{} published test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/protocol", "plays {} episodes of {} steps", lambda: (SEEDED.episodes, SEEDED.steps)),
+    ("docs/training", "to earn {} of .. on track `teammate` ({} without", agent_proof),
     ("docs/evaluating", "the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
     ("docs/protocol", "up to {} [drawn", max_validation_tasks_per_layout),
     ("docs/protocol", "{} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),

@@ -36,7 +36,9 @@ def requirements() -> list[Requirement]:
 
 @pytest.mark.parametrize("schema", SCHEMAS)
 def test_files_match_their_schemas(schema):
-    done = CliRunner().invoke(check_jsonschema.main, ["--builtin-schema", f"vendor.{schema}", *map(str, SCHEMAS[schema])])
+    done = CliRunner().invoke(
+        check_jsonschema.main, ["--builtin-schema", f"vendor.{schema}", *map(str, SCHEMAS[schema])]
+    )
     assert done.exit_code == 0, done.output
 
 
