@@ -37,15 +37,15 @@ from icrl4aht_generation.profiles.noise_config import NoiseConfig
 BYTES_PER_STEP: dict[tuple[Kind, str], float] = {
     ("lite", "ppo"): 1.92,
     ("full", "ppo"): 9.23,
-    ("lite", "noise"): 2.79,
+    ("lite", "noise"): 2.3,
     ("full", "noise"): 12.01,
-    ("lite", "search"): 1.52,
+    ("lite", "search"): 1.85,
     ("full", "search"): 12.01,
 }
-"""Bytes of a transition in a release's shards, by kind and source, measured on the bundled release."""
+"""Bytes of a transition in a release's shards, by kind and source, measured on the bundled release and on `teach`."""
 
-BYTES_PER_HISTORY = {"search": 570}
-"""Additional bytes of each history in shards, for sources with short histories (measured at 500 and 1,000 steps)."""
+BYTES_PER_HISTORY = {"search": 620}
+"""Additional bytes of each history in shards, for sources with short histories (measured at 500 and 6,000 steps)."""
 
 META_BYTES = {"transitions": 0.12, "histories": 900, "tasks": 1400}
 """Bytes of the index and the hashes of a release for each transition, history and task, measured on the bundled
