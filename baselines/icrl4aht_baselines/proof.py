@@ -220,14 +220,16 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
     """
     stay, expert = (references[TEAMMATE_TRACK][name]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
     options, dataset, runs = jobs[0].options, load_icrl4aht(jobs[0].options.root), []
+    hashes = {source: histories_hash(dataset.index, source) for source in {job.source for job in jobs}}
     for job in (job for job in jobs if job.is_finished()):
-        returns, minutes = job.result()["returns"], job.result()["minutes"]
+        result = job.result()
+        returns = result["returns"]
         entry: dict[str, Any] = {
             "histories": job.source,
             "learner": LEARNERS[job.learner].title,
             "seed": job.seed,
-            "histories_sha256": histories_hash(dataset.index, job.source),
-            "minutes": minutes,
+            "histories_sha256": hashes[job.source],
+            "minutes": result["minutes"],
         }
         for memory, control in (("", ""), ("_cleared", " cleared")):
             for when, block in (("first", "1"), ("late", "6-20")):

@@ -238,7 +238,7 @@ def check(a: Path, b: Path, as_json: bool) -> None:
     """Compare two generated releases bit for bit.
 
     A and B are releases, or other folders that `generate` wrote. Prints the differences, and exits with 1 if there are
-    any. Logs of timing and of failures are not compared. Writes nothing.
+    any. Times, logs of failures and measurements are not compared. Writes nothing.
     """
     from icrl4aht_generation.releases.check import compare_rebuilds
 

@@ -14,7 +14,7 @@ import numpy as np
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, ShardCorruptError
 from icrl4aht_data.format import safe_hdf5
-from icrl4aht_data.format.chunks import METADATA_ROW_BYTES, chunk_locations, stored_chunks
+from icrl4aht_data.format.chunks import METADATA_ROW_BYTES, chunk_locations
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, KINDS, curve_fields, episode_ends, record_field
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
@@ -218,8 +218,7 @@ def _structure_faults(shard: Shard, file: h5py.File, open_dataset: Callable[[str
             expected = f"expected filters, type, shape and chunks {(filters, element, *shapes)}"
             yield f"{path}: {expected}, found {found}"
     if not faults:
-        chunks_of = cache(lambda path: stored_chunks(open_dataset(path)))
-        chunks = [chunk for entry in entries for chunk in chunk_locations(chunks_of, shard.kind, entry)]
+        chunks = chunk_locations(open_dataset, shard.kind, entries)
         table = shard.table[["offset", "size", "rows"]][: len(chunks)].tolist()
         wrong = [row for row, (a, b) in enumerate(zip(chunks, table, strict=True)) if a != b]
         if wrong:

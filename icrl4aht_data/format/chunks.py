@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,30 @@ def read_table(path: Path) -> np.ndarray:
     return table
 
 
-def stored_chunks(dataset: Any) -> dict[tuple[int, ...], tuple[int, int]]:
+def chunk_locations(
+    open_dataset: Callable[[str], Any], kind: Kind, entries: Iterable[Entry]
+) -> list[tuple[int, int, int]]:
+    """Return (offset, size, rows) of each chunk of histories, as reported by HDF5, in the order of the chunk table.
+
+    Offset and size of a chunk that is not stored are 0.
+
+    Args:
+        open_dataset: function from the path of a dataset in the shard to the HDF5 dataset.
+        kind: kind of the release.
+        entries: index entries of the histories.
+    """
+    chunks_of = cache(lambda path: _stored_chunks(open_dataset(path)))  # histories of a task share datasets
+    locations = []
+    for entry in entries:
+        for field in entry.stored_fields(kind):
+            stored, rows = chunks_of(f"{entry.h5_group}/{field.name}"), entry.rows(field)
+            for start in range(0, rows, field.chunk):
+                position = (start,) if entry.h5_row is None else (entry.h5_row, start)
+                locations.append((*stored.get(position, (0, 0)), min(field.chunk, rows - start)))
+    return locations
+
+
+def _stored_chunks(dataset: Any) -> dict[tuple[int, ...], tuple[int, int]]:
     """Return (offset, size) of each stored chunk of an HDF5 dataset, by the position of the chunk's first element."""
     found: dict[tuple[int, ...], tuple[int, int]] = {}
 
@@ -69,27 +93,6 @@ def stored_chunks(dataset: Any) -> dict[tuple[int, ...], tuple[int, int]]:
 
     dataset.id.chunk_iter(add)
     return found
-
-
-def chunk_locations(
-    chunks_of: Callable[[str], Mapping[tuple[int, ...], tuple[int, int]]], kind: Kind, entry: Entry
-) -> list[tuple[int, int, int]]:
-    """Return (offset, size, rows) of each chunk of a history, as reported by HDF5, in the order of the chunk table.
-
-    Offset and size of a chunk that is not stored are 0.
-
-    Args:
-        chunks_of: function from the path of a dataset in the shard to the dataset's `stored_chunks`.
-        kind: kind of the release.
-        entry: index entry of the history.
-    """
-    locations = []
-    for field in entry.stored_fields(kind):
-        stored, rows = chunks_of(f"{entry.h5_group}/{field.name}"), entry.rows(field)
-        for start in range(0, rows, field.chunk):
-            position = (start,) if entry.h5_row is None else (entry.h5_row, start)
-            locations.append((*stored.get(position, (0, 0)), min(field.chunk, rows - start)))
-    return locations
 
 
 def chunk_hash(data: bytes) -> bytes:

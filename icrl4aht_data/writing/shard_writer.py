@@ -21,7 +21,6 @@ from icrl4aht_data.format.chunks import (
     chunk_locations,
     chunk_table_name,
     encode_chunk,
-    stored_chunks,
 )
 from icrl4aht_data.format.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -71,8 +70,7 @@ def write_shard(
             for field, start, data in sorted(chunks, key=lambda chunk: chunk_sort_key(chunk.field, chunk.start)):
                 position = (start,) if entry.h5_row is None else (entry.h5_row, start)
                 open_dataset(f"{entry.h5_group}/{field.name}").id.write_direct_chunk(position, data)
-        chunks_of = cache(lambda name: stored_chunks(open_dataset(name)))
-        locations = [row for entry in entries for row in chunk_locations(chunks_of, kind, entry)]
+        locations = chunk_locations(open_dataset, kind, entries)
         stored = [chunk.data for chunks in histories for chunk in chunks]
         rows = [(*row, *_checksums(data)) for row, data in zip(locations, stored, strict=True)]
         table = np.array(rows, CHUNK_DTYPE)

@@ -228,7 +228,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/index", "{} test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/adapters", "{} published test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/protocol", "plays {} episodes of {} steps", lambda: (SEEDED.episodes, SEEDED.steps)),
-    ("docs/training", "to earn {} of .. on track `teammate` ({} without", agent_proof),
+    ("docs/training", "AD earned {} of .. on track `teammate` ({} without", agent_proof),
     ("docs/evaluating", "the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
     ("docs/protocol", "up to {} [drawn", max_validation_tasks_per_layout),
     ("docs/protocol", "{} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),

@@ -50,7 +50,9 @@ def test_names_that_notebooks_import_exist(path):
     cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
     code = "\n".join(line for text in cells if text[:2] != "%%" for line in text.splitlines() if line[:1] not in "%!")
     imports = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.ImportFrom)]
-    own = [(node.module, alias.name) for node in imports for alias in node.names if str(node.module)[:8] == "icrl4aht"]
+    own = [
+        (node.module, alias.name) for node in imports for alias in node.names if str(node.module).startswith("icrl4aht")
+    ]
     assert own
     for module, name in own:
         assert hasattr(import_module(str(module)), name), f"{module} has no {name}"

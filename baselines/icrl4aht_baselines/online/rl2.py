@@ -443,7 +443,7 @@ class PlayTrainer:
         ]
         tasks, sequences, returns = zip(*played, strict=True)
         falling = jnp.maximum(0.0, 1.0 - state.step / (self.play.imitation_end * self.options.steps))
-        weight = jnp.float32(self.play.imitation) * falling
+        weight = self.play.imitation * falling
         # Minibatches are sampled from the tasks of all players together, so that a minibatch has many layouts.
         params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
         earned = jnp.concatenate(returns)

@@ -100,9 +100,8 @@ def write_stored(path: Path, stored: StoredResults) -> None:
     for file, frame, digits in zip(_table_paths(path), (stored.table, stored.curves), (3, 2), strict=True):
         with atomic_write(file) as partial:
             text = frame.round(digits).to_csv(index=False, lineterminator="\n")
-            partial.write_bytes(
-                lzma.compress(text.encode(), preset=lzma.PRESET_EXTREME | 9)
-            )  # half the size of gzip's output
+            # LZMA's output has half the size of gzip's.
+            partial.write_bytes(lzma.compress(text.encode(), preset=lzma.PRESET_EXTREME | 9))
     with atomic_write(path) as partial:
         write_json(partial, msgspec.to_builtins(stored.agents))
 

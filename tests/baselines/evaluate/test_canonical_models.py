@@ -31,6 +31,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.commands import run_cli
 from tests.helpers.host_agents import HostRecorder
+from tests.helpers.layout_params import layout_params
 from tests.helpers.random_releases import random_release
 from tests.helpers.states import random_records
 
@@ -75,8 +76,8 @@ def test_model_is_evaluated_on_a_layout_without_training_data(trained_run, tmp_p
     assert "| cramped_down | `" in card and ", manifest with SHA-256 `" in card
 
 
-@pytest.mark.parametrize("name", ["coord_ring", "test_wide", "cramped_down"])
-def test_jax_egos_receive_canonical_channels(name):
+@pytest.mark.parametrize("name", layout_params(["coord_ring", "test_wide", "cramped_down"]))
+def test_jax_egos_receive_canonical_channels_on_every_layout(name):
     """The policy returns its input instead of an action, so the test can compare observations."""
     layout = get_layout(name)
     shown = Policy((), lambda params, key: (), lambda params, memory, ego_input, key: (ego_input, memory), "ego_input")

@@ -152,7 +152,7 @@ def test_imitation_loss_makes_the_actions_of_the_script_likelier(trainer, compil
         params, optimizer = jax.tree.map(jnp.copy, (state.params, state.optimizer))
         losses = []
         for _ in range(6):
-            learned = trainer._learn(params, optimizer, (played,), jax.random.key(1), jnp.float32(weight))
+            learned = trainer._learn(params, optimizer, (played,), jax.random.key(1), jnp.asarray(weight))
             params, optimizer, log = learned
             losses.append(float(log["imitation_loss"]))
         fallen[weight] = losses[0] - losses[-1]

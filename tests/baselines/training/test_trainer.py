@@ -199,11 +199,14 @@ class TestRunFolder:
         with pytest.raises(OptionError, match=r"train.batch_size: found 4, expected 1000000000"):
             open_run(tmp_path / "run", first)
 
-    def test_refused_training_leaves_no_folder(self, tmp_path):
+    def test_refused_training_leaves_no_folder_and_the_corrected_command_runs(self, tmp_path):
         small = "--layers 1 --width 16 --context 10 --steps 1"
+        command = f"train ad --layout demo_wide {small} --out {tmp_path / 'big'} --batch-size"
         with pytest.raises(OptionError, match=r"batch_size = 1000000000, .* more than is free"):
-            run_cli(f"train ad --layout demo_wide {small} --out {tmp_path / 'big'} --batch-size {10**9}")
+            run_cli(f"{command} {10**9}")
         assert not list(tmp_path.iterdir())
+        run_cli(f"{command} 2")
+        assert Checkpoints(tmp_path / "big" / CHECKPOINTS).latest == 1
 
     def test_run_folder_with_other_files_raises_error(self, tmp_path):
         (tmp_path / "notes.txt").touch()

@@ -19,7 +19,7 @@ from icrl4aht_data.errors import NotStoredError, OptionError, TaskFormatError, U
 from icrl4aht_data.overcooked.state import record_size
 from tests.helpers.commands import run_python
 
-NAME = "icrl4aht/demo_wide-H1-t0-v0"
+NAME = "icrl4aht/demo_wide-H4-t0-v0"
 
 
 @pytest.fixture(scope="module")
@@ -161,16 +161,16 @@ def test_invalid_reset_options_raise_errors(env, options, error, message):
 
 
 def test_wrong_use_of_task_environment_raises_errors():
-    fresh = published_environment("demo_wide", "H1/t0")
+    fresh = published_environment("demo_wide", "H4/t0")
     with pytest.raises(OptionError, match="call reset"):
         fresh.step(0)
     fresh.reset(seed=0)
     with pytest.raises(OptionError, match=r"action: expected 0\.\.5 \(up, down, .*\), found 6"):
         fresh.step(6)
-    task = asdict(published_task("demo_wide", "H1/t0"))
+    task = asdict(published_task("demo_wide", "H4/t0"))
     with pytest.raises(TaskFormatError, match="expected the fields"):
         TaskEnv({name: value for name, value in task.items() if name != "seed"})
-    for wrong_task in ("foo", published_task("demo_wide", "H1/t0")):
+    for wrong_task in ("foo", published_task("demo_wide", "H4/t0")):
         with pytest.raises(TaskFormatError, match=r"task = .*: expected the fields of a task by name"):
             gymnasium.make("icrl4aht/task-v0", task=wrong_task)
     assert repr(fresh) == f"TaskEnv(demo_wide, task {task['task_id']})"

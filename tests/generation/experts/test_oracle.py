@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +22,7 @@ from icrl4aht_data.overcooked.cells import COOKED
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
 from icrl4aht_data.overcooked.rules import CORRECT, PRESSED, WRONG, step
 from icrl4aht_data.overcooked.state import ingredient_count, unpack
+from tests.helpers.layout_params import layout_params
 
 SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=2)
 TASKS = [task for track in TRACKS for task in published_tasks(track)]
@@ -38,11 +38,7 @@ FAMILY_ON = {
     "asymm_right": "H3",
     "cramped_down": "H3",
 }
-
-
-def layout_params(*names: str) -> list[Any]:
-    """Return test parameters for layouts; all but asymm_right are marked slow."""
-    return [pytest.param(name, marks=[] if name == "asymm_right" else [pytest.mark.slow]) for name in names]
+QUICK = ["asymm_right"]
 
 
 def h4_ego(layout: Layout) -> Policy:
@@ -60,19 +56,19 @@ def episodes(agent: str, layout: str) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return record, actions, reward
 
 
-@pytest.mark.parametrize("layout", layout_params(*FAMILY_ON))
+@pytest.mark.parametrize("layout", layout_params(QUICK, FAMILY_ON))
 def test_oracle_never_presses_buttons_or_delivers_wrong_dishes(layout):
     record, actions, _ = episodes("oracle", layout)
     events = step(LAYOUTS[layout], record, actions, record[..., 6]).events[..., EGO]
     assert not (events & (PRESSED | WRONG)).any()
 
 
-@pytest.mark.parametrize("layout", layout_params("coord_simple", "test_simple"))
+@pytest.mark.parametrize("layout", layout_params(QUICK, ["coord_simple", "test_simple"]))
 def test_oracle_stays_if_the_agents_can_share_no_items(layout):
     assert (episodes("oracle", layout)[1][..., EGO] == STAY).all()
 
 
-@pytest.mark.parametrize("layout", layout_params("test_wide", "asymm_right", "cramped_down"))
+@pytest.mark.parametrize("layout", layout_params(QUICK, ["test_wide", "asymm_right", "cramped_down"]))
 def test_oracle_earns_more_than_h4_in_the_same_slot(layout):
     oracle, other = (episodes(agent, layout)[2].sum(axis=1).mean() for agent in ("oracle", "h4"))
     assert oracle > other

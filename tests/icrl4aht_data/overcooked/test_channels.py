@@ -18,6 +18,7 @@ from icrl4aht_data.overcooked.channels import (
 )
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe, observe_both
+from tests.helpers.layout_params import layout_params
 from tests.helpers.states import random_records
 
 each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
@@ -67,9 +68,11 @@ def test_canonical_observations_equal_channels_moved_by_name(layout):
         np.testing.assert_array_equal(observe_both(layout, records, canonical=True)[:, agent], expected, strict=True)
 
 
-@pytest.mark.parametrize("name", ["test_wide", "coord_ring", "cramped_up"])
-def test_compiled_canonical_observations_equal_those_of_numpy(name):
+@pytest.mark.parametrize("name", layout_params(["test_wide", "coord_ring", "cramped_up"]))
+@pytest.mark.parametrize("agent", [0, 1])
+def test_compiled_canonical_observations_equal_those_of_numpy(name, agent):
     layout = get_layout(name)
     records = random_records(layout, 200, np.random.default_rng(5))
-    rendered = jax.jit(partial(observe_both, layout, canonical=True))(records)
-    np.testing.assert_array_equal(np.asarray(rendered), observe_both(layout, records, canonical=True), strict=True)
+    rendered = jax.jit(partial(observe, layout, agent=agent, canonical=True))(records)
+    expected = observe(layout, records, agent, canonical=True)
+    np.testing.assert_array_equal(np.asarray(rendered), expected, strict=True)

@@ -14,6 +14,7 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout, with_r
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns, record_size
 from icrl4aht_data.overcooked.words import cell_words
+from tests.helpers.layout_params import layout_params
 from tests.helpers.random_releases import random_history
 from tests.helpers.states import random_records
 
@@ -36,12 +37,11 @@ def test_channels_of_words_equal_the_observation(layout, agent):
     np.testing.assert_array_equal(words.channels[ids].reshape(expected.shape), expected)
 
 
-@pytest.mark.parametrize("layout", [LAYOUTS["test_wide"], LAYOUTS["cramped_up"]])
-def test_compiled_words_equal_those_of_numpy(layout):
-    """Words of agent 1; those of agent 0 are compiled for all layouts at once, see below."""
-    records, words = example_records(layout), cell_words((layout,))
-    compiled = jax.jit(partial(words.ids, agent=1))
-    np.testing.assert_array_equal(compiled(records), words.ids(records, agent=1))
+@pytest.mark.parametrize("name", layout_params(["test_wide", "cramped_up"]))
+@pytest.mark.parametrize("agent", [0, 1])
+def test_compiled_words_equal_those_of_numpy(name, agent):
+    records, words = example_records(get_layout(name)), cell_words((get_layout(name),))
+    np.testing.assert_array_equal(jax.jit(partial(words.ids, agent=agent))(records), words.ids(records, agent=agent))
 
 
 @each_layout
