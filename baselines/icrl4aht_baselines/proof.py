@@ -51,18 +51,16 @@ class ProofLearner(NamedTuple):
     Attributes:
         method: name of the method.
         labels: "expert" for expert labels, or None for the actions in the histories.
-        title: name in tables.
     """
 
     method: str
     labels: Literal["expert"] | None
-    title: str
 
 
 LEARNERS = {
-    "ad": ProofLearner("ad", None, "AD, own actions"),
-    "ad-expert": ProofLearner("ad", "expert", "AD, expert labels"),
-    "dpt-expert": ProofLearner("dpt", "expert", "DPT, expert labels"),
+    "ad": ProofLearner("ad", None),
+    "ad-expert": ProofLearner("ad", "expert"),
+    "dpt-expert": ProofLearner("dpt", "expert"),
 }
 """Name on the command line and in folders -> learner."""
 
@@ -132,8 +130,8 @@ class ProofJob(TrainingJob):
 
     @property
     def label(self) -> str:
-        """Name of the job that progress displays show: method, labels, source and seed."""
-        return f"{LEARNERS[self.learner].title}, {self.source} histories, seed {self.seed}"
+        """Name of the job that progress displays show: learner, source and seed."""
+        return f"{self.learner}, {self.source} histories, seed {self.seed}"
 
     @property
     def first(self) -> int:
@@ -222,20 +220,26 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
     options, dataset, runs = jobs[0].options, load_icrl4aht(jobs[0].options.root), []
     hashes = {source: histories_hash(dataset.index, source) for source in {job.source for job in jobs}}
     for job in (job for job in jobs if job.is_finished()):
-        result = job.result()
+        learner, result = LEARNERS[job.learner], job.result()
         returns = result["returns"]
         entry: dict[str, Any] = {
             "histories": job.source,
-            "learner": LEARNERS[job.learner].title,
+            "method": learner.method.upper(),
+            "labels": learner.labels or "own",
             "seed": job.seed,
             "histories_sha256": hashes[job.source],
             "minutes": result["minutes"],
         }
-        for memory, control in (("", ""), ("_cleared", " cleared")):
-            for when, block in (("first", "1"), ("late", "6-20")):
-                entry[when + memory] = returns[PREFERENCE + control][block]
         share = (returns[TEAMMATE_TRACK]["all"] - stay) / (expert - stay)
-        runs.append(entry | {"share": round(share, 3)})
+        runs.append(
+            entry
+            | {
+                "first": returns[PREFERENCE]["1"],
+                "late": returns[PREFERENCE]["6-20"],
+                "late_cleared": returns[f"{PREFERENCE} cleared"]["6-20"],
+                "share": round(share, 3),
+            }
+        )
     content: dict[str, Any] = {
         "data_version": dataset.info.data_version,
         "training": {"steps": options.steps, "batch_size": options.batch_size, "context": options.context},

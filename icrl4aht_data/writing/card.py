@@ -290,7 +290,7 @@ def _curve_rows(learning: Iterable[Mapping[str, Any]], sources: Iterable[str]) -
     """Return the card's table of learning curves as rows: one row per layout and split, one column per source."""
     found = defaultdict[tuple[str, str], dict[str, str]](dict)
     for row in learning:
-        text = f"{row['first']:z.1f} to {row['last']:z.1f} ({row['histories']})"
+        text = f"{row['first']:z.1f}→{row['last']:z.1f} ({row['histories']})"
         found[row["layout"], row["split"]][row["source"]] = text
     return [[*key, *(of_key.get(source, "") for source in sources)] for key, of_key in found.items()]
 

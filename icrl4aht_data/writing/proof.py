@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from icrl4aht_data.benchmark.facts import SOURCES
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import Index, read_index
@@ -19,7 +20,7 @@ from icrl4aht_data.utils.text import card_file, markdown_table
 
 PROOF_FILE = "proof.json"
 
-RUN_KEY = ("histories", "learner", "seed")
+RUN_KEY = ("histories", "method", "labels", "seed")
 """Fields that identify a training run in the file."""
 
 _COLUMNS = {
@@ -27,14 +28,13 @@ _COLUMNS = {
     "late": "episodes 6-20",
     "late_cleared": "6-20, cleared",
     "share": "teammate track",
-    "minutes": "minutes",
 }
 
 
 def read_proof(root: Path) -> dict[str, Any] | None:
     """Return the content of `cards/proof.json` with the training runs on histories of a release.
 
-    The result is None if there are no such runs.
+    `trainings` is added: the number of runs in each row of `proof_table`. The result is None if there are no such runs.
 
     Args:
         root: folder of the release.
@@ -44,7 +44,14 @@ def read_proof(root: Path) -> dict[str, Any] | None:
     except OptionError:  # the file has not been made yet
         return None
     runs = runs_on(read_index(root), content["runs"])
-    return content | {"runs": runs} if runs else None
+    return content | {"runs": runs, "trainings": [len(own) for own in _runs_by_row(runs).values()]} if runs else None
+
+
+def _runs_by_row(runs: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str, str], list[Mapping[str, Any]]]:
+    """Return histories, method and labels -> training runs, ordered by the source of the histories."""
+    order = [*SOURCES, "all"]
+    ordered = sorted(runs, key=lambda one: order.index(one["histories"]))
+    return grouped(ordered, lambda one: (one["histories"], one["method"], one["labels"]))
 
 
 def runs_on(index: Index, runs: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -73,12 +80,11 @@ def proof_table(proof: Mapping[str, Any]) -> str:
 
     In the first episode the memory is empty, so clearing it changes nothing.
     """
-    models = grouped(proof["runs"], lambda one: (one["histories"], one["learner"]))
     rows = [
-        [*model, str(len(runs)), *(_mean_text([one[key] for one in runs], key) for key in _COLUMNS)]
-        for model, runs in models.items()
+        [*row, *(_mean_text([one[key] for one in own], key) for key in _COLUMNS)]
+        for row, own in _runs_by_row(proof["runs"]).items()
     ]
-    return markdown_table(["histories", "model", "trainings", *_COLUMNS.values()], rows, right=1 + len(_COLUMNS))
+    return markdown_table(["histories", "model", "labels", *_COLUMNS.values()], rows, right=len(_COLUMNS))
 
 
 def _mean_text(values: Sequence[float], key: str) -> str:

@@ -65,13 +65,13 @@ def test_proof_has_an_entry_for_each_training_run_and_keeps_comparable_ones(rele
     assert run["share"] == 0.5  # the model earns 10, and rl2-reference earns 20
     assert [one["seed"] for one in written(first)] == [0, 1]
     own = finish(ProofJob("all", "ad", 0, options, tmp_path), 0.0)
-    assert [(one["learner"], one["seed"]) for one in written(own, first)] == [
-        ("AD, expert labels", 0),
-        ("AD, expert labels", 1),
-        ("AD, own actions", 0),
+    assert [(one["method"], one["labels"], one["seed"]) for one in written(own, first)] == [
+        ("AD", "expert", 0),
+        ("AD", "expert", 1),
+        ("AD", "own", 0),
     ]
-    spreads = ["-2.0 (-2.0..-2.0)", "15.0 (10.0..20.0)", "-1.0 (-1.0..-1.0)", "0.38 (0.25..0.50)", "20.0 (20.0..20.0)"]
-    assert " | ".join(["| all | AD, expert labels | 2", *spreads]) in proof_table(json.loads(path.read_text()))
+    spreads = ["-2.0 (-2.0..-2.0)", "15.0 (10.0..20.0)", "-1.0 (-1.0..-1.0)", "0.38 (0.25..0.50)"]
+    assert " | ".join(["| all | AD | expert", *spreads]) in proof_table(json.loads(path.read_text()))
 
     content = json.loads(path.read_text())
     content["runs"][0]["histories_sha256"] = "0"
@@ -82,8 +82,8 @@ def test_proof_has_an_entry_for_each_training_run_and_keeps_comparable_ones(rele
 
 
 def test_dataset_card_shows_only_results_of_models_trained_on_its_release(release, tmp_path, monkeypatch):
-    run = dict.fromkeys(("first", "late", "first_cleared", "late_cleared", "share", "minutes"), 1.0)
-    run |= {"histories": "ppo", "learner": "AD", "seed": 0}
+    run = dict.fromkeys(("first", "late", "late_cleared", "share", "minutes"), 1.0)
+    run |= {"histories": "ppo", "method": "AD", "labels": "own", "seed": 0}
     run |= {"histories_sha256": histories_hash(read_index(release), "ppo")}
     content = {
         "training": {"steps": 800, "batch_size": 16, "context": 500},
@@ -94,11 +94,12 @@ def test_dataset_card_shows_only_results_of_models_trained_on_its_release(releas
     stored = tmp_path / "proof.json"
     monkeypatch.setattr(proof, "card_file", lambda name: stored)
     stored.write_text(json.dumps(content))
-    assert read_proof(release) == content
-    assert "## What it teaches" in render_card(card_facts(release))
+    assert read_proof(release) == content | {"trainings": [1]}
+    card = render_card(card_facts(release))
+    assert "## What it teaches" in card and "minutes on one core: 1; trainings of each row: 1" in card
     other = run | {"histories_sha256": "0"}
     stored.write_text(json.dumps(content | {"runs": [other, run]}))
-    assert read_proof(release) == content
+    assert read_proof(release) == content | {"trainings": [1]}
     stored.write_text(json.dumps(content | {"runs": [other]}))
     assert read_proof(release) is None
     assert "## What it teaches" not in render_card(card_facts(release))

@@ -151,9 +151,10 @@ def read_stored_proof() -> dict[str, Any]:
     return json.loads((ROOT / "cards" / "proof.json").read_text(encoding="utf-8"))
 
 
-def proof_mean(histories: str, learner: str, name: str) -> float:
+def proof_mean(histories: str, method: str, labels: str, name: str) -> float:
     """Return the mean of a value over the three training runs of a model in the proof of the bundled release."""
-    runs = [one for one in read_stored_proof()["runs"] if (one["histories"], one["learner"]) == (histories, learner)]
+    key = (histories, method, labels)
+    runs = [one for one in read_stored_proof()["runs"] if (one["histories"], one["method"], one["labels"]) == key]
     assert len(runs) == 3
     return fmean(one[name] for one in runs)
 
@@ -161,13 +162,13 @@ def proof_mean(histories: str, learner: str, name: str) -> float:
 def search_proof() -> tuple[float, ...]:
     """Return the number of tasks, and returns of AD on `search` histories in episodes 1 and 6 to 20, also cleared."""
     return read_stored_proof()["tasks"]["preference"], *(
-        proof_mean("search", "AD, expert labels", name) for name in ("first", "late", "late_cleared")
+        proof_mean("search", "AD", "expert", name) for name in ("first", "late", "late_cleared")
     )
 
 
 def agent_proof() -> tuple[float, float]:
     """Return the shares that AD on `agent` histories earns with `expert` labels, and with own actions."""
-    return proof_mean("agent", "AD, expert labels", "share"), proof_mean("agent", "AD, own actions", "share")
+    return proof_mean("agent", "AD", "expert", "share"), proof_mean("agent", "AD", "own", "share")
 
 
 def training_teammates_like_tests() -> tuple[int, ...]:

@@ -92,7 +92,7 @@ def test_card_lists_returns_by_layout_source_and_split(write_meta):
         ("demo_wide", "noise", "validation", 1, 2.0, 30.0, None, 1.0),
         ("coord_simple", "ppo", "train", 1, 10.0, 10.0, None, 0.0),
     ]
-    assert "| demo_wide | train | 0.0 to 12.0 (2) | 0.5 to 43.0 (2) |" in render_card(content)
+    assert "| demo_wide | train | 0.0→12.0 (2) | 0.5→43.0 (2) |" in render_card(content)
 
 
 def test_long_tables_are_written_to_card_json(write_meta, tmp_path):
