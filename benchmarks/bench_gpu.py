@@ -39,6 +39,7 @@ import jax.numpy as jnp
 from icrl4aht_baselines.agents.egos import trained_policy
 from icrl4aht_baselines.evaluate.evaluator import play_episodes, prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
+from icrl4aht_baselines.methods.ad import dropped_steps
 from icrl4aht_baselines.methods.options import SIZES
 from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_baselines.training.trainer import Trainer
@@ -249,7 +250,7 @@ def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) ->
     prepared = prepare_rollout(lambda layout: policy, tasks, protocol, range(seeds))
     compile_seconds = time.perf_counter() - started
     episodes = play_episodes(prepared)
-    filling, shortest = -(-context // sizes.episode_steps), 2 * -(-context // 5 // sizes.episode_steps)
+    filling, shortest = -(-context // sizes.episode_steps), 2 * -(-dropped_steps(context) // sizes.episode_steps)
     for _ in islice(episodes, filling):  # fill the windows; a full window drops a fifth of its steps
         pass
     seconds = call_durations(partial(next, episodes), sizes.seconds, least=max(3, shortest))

@@ -74,7 +74,7 @@ def load_icrl4aht(
             for any value. Train models on "train" only; samplers warn about a mixture of splits.
         layout: a short name (coord_simple) or an environment name (grounded_coord_simple).
         layout_family: "published", or a family of layouts that the release stores, such as "templates".
-        track: "teammate" or "layout": which of the two is new in the test tasks.
+        track: "teammate", "layout" or "preference": what is new in the test tasks.
         teammate_family: "rl" (learned) or "H1".."H4" (heuristics).
         teammate_kind: an algorithm or a heuristic, such as "fcp" or "utility_greedy".
         algorithm: alias of `teammate_kind` for learned teammates, such as "fcp" or "comedi".

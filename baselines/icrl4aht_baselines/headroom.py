@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from icrl4aht_baselines.agents.egos import find_agent
-from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks, get_protocol
+from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, SUBMITTED_SEEDS, bundled_tasks, get_protocol
 from icrl4aht_baselines.online.responses import find_behaviours
 from icrl4aht_baselines.report.page import PAPER_METHODS, published_cells
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, evaluate_agent
-from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, SUBMITTED_SEEDS
+from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL
 from icrl4aht_data.benchmark.facts import PREFERENCE, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
 from icrl4aht_data.utils.text import markdown_table

@@ -3,7 +3,7 @@
     OUT/SOURCE-LEARNER-sSEED/run         run folder of a training job
     OUT/SOURCE-LEARNER-sSEED/results     results on the sets of validation tasks, with memory and without
     OUT/references/...                   results of egos to compare with
-    OUT/proof.json                       summary of all results, which the card of the release shows
+    OUT/proof.json                       summary of all results
 
 Each training is a job of a queue. Finished jobs are reused, and stopped jobs resume.
 """
@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -30,7 +32,7 @@ from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, Tra
 from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import load_icrl4aht
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import parse_json, read_json, read_text, write_json
 from icrl4aht_data.writing.proof import RUN_KEY, histories_hash, runs_on
 
 TEAMMATE_TRACK = "teammate"
@@ -39,10 +41,10 @@ PROOF_PROTOCOL = get_protocol("seeded", 20)
 """Protocol of the evaluations, with 20 episodes, because the proof reports the episodes 1 and 6 to 20."""
 
 _SEEDS = {PREFERENCE: range(4), TEAMMATE_TRACK: range(1)}
-"""Set of tasks -> seeds of its tasks. The first episode is reported separately, so one seed would be too few."""
+"""Track -> seeds of its tasks. On `preference` the first episode is reported separately, which needs several seeds."""
 
 COMPARED_EGOS = {PREFERENCE: ("stay", "search"), TEAMMATE_TRACK: ("stay", "rl2-reference")}
-"""Set of tasks -> names of the egos that models are compared with."""
+"""Track -> names of the egos that models are compared with."""
 
 
 class ProofLearner(NamedTuple):
@@ -88,7 +90,7 @@ class ProofOptions:
         steps: number of training steps; with the defaults, a job takes about 30 minutes on a core.
         batch_size: number of windows or contexts in a batch.
         context: K, steps of a window or transitions of a context.
-        tasks: name of a set -> its tasks; by default the validation tasks that `proof_tasks` returns.
+        tasks: name of a track -> its tasks; by default the validation tasks that `proof_tasks` returns.
     """
 
     root: str | None = None
@@ -140,9 +142,16 @@ class ProofJob(TrainingJob):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All settings that the result depends on, as JSON. The content of the release is not included."""
-        tasks = {name: [task.task_id for task in own] for name, own in self.options.tasks.items()}
-        return {"train": asdict(self.training), "root": self.options.root, "tasks": tasks, "first": self.first}
+        """All settings that the result depends on, as JSON."""
+        return {
+            "histories_sha256": _histories_hash(self.options.root, self.source),
+            "first": self.first,
+            "model": asdict(_MODEL),
+            "train": asdict(self.training),
+            "protocol": PROOF_PROTOCOL.settings,
+            "tasks": {track: [task.task_id for task in own] for track, own in self.options.tasks.items()},
+            "code_version": version("icrl4aht-data"),
+        }
 
     def finished_text(self) -> str:
         """Return text for progress displays: mean returns on the track `preference`."""
@@ -163,6 +172,11 @@ class ProofJob(TrainingJob):
         }
 
 
+@cache
+def _histories_hash(root: str | None, source: str) -> str:
+    return histories_hash(load_icrl4aht(root).index, source)
+
+
 def _training_seconds(timing: Path) -> float:
     """Return the duration of a training run in seconds, from its timing log, including steps before interruptions."""
     lines = [parse_json(line) for line in read_text(timing).splitlines()]
@@ -171,38 +185,38 @@ def _training_seconds(timing: Path) -> float:
 
 
 def evaluate_on_sets(agent: NamedEgo, options: ProofOptions, out: Path) -> dict[str, dict[str, float]]:
-    """Evaluate an agent on each set of validation tasks.
+    """Evaluate an agent on the validation tasks of each track.
 
     On the track `preference` it also plays with its memory cleared before each episode.
 
     Args:
         agent: agent to evaluate.
-        options: settings with the sets of tasks.
+        options: settings with the tasks of each track.
         out: folder of the results.
 
     Returns:
-        Name of the set, followed by " cleared" for cleared memory -> block of episodes -> mean return.
+        Name of the track, followed by " cleared" for cleared memory -> block of episodes -> mean return.
     """
     found = {}
-    for name, tasks in options.tasks.items():
-        for control in (None, "cleared") if name == PREFERENCE else (None,):
-            folder = out / f"{name}{' cleared' if control else ''}"
+    for track, tasks in options.tasks.items():
+        for control in (None, "cleared") if track == PREFERENCE else (None,):
+            folder = out / f"{track}{' cleared' if control else ''}"
             hidden: Any = {"show": lambda *shown: None}
-            found[folder.name] = _mean_returns(agent, name, tasks, folder, control=control, **hidden)
+            found[folder.name] = _mean_returns(agent, track, tasks, folder, control=control, **hidden)
     return found
 
 
-def _mean_returns(agent: NamedEgo, name: str, tasks: Sequence[Task], folder: Path, **options: Any) -> dict[str, float]:
-    """Return block of episodes -> mean return of an agent on a set of validation tasks.
+def _mean_returns(agent: NamedEgo, track: str, tasks: Sequence[Task], folder: Path, **options: Any) -> dict[str, float]:
+    """Return block of episodes -> mean return of an agent on the validation tasks of a track.
 
     Args:
         agent: agent to evaluate.
-        name: name of the set.
-        tasks: tasks of the set.
+        track: name of the track.
+        tasks: tasks of the track.
         folder: folder of the results.
         options: further arguments for `evaluate_agent`.
     """
-    run = evaluate_agent(agent, tasks, PROOF_PROTOCOL, folder, seeds=_SEEDS[name], **options)
+    run = evaluate_agent(agent, tasks, PROOF_PROTOCOL, folder, seeds=_SEEDS[track], **options)
     means = run.table.groupby("block")["return"].mean()
     return {str(block): round(float(mean), 3) for block, mean in means.items()}
 
@@ -214,11 +228,10 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
         jobs: training jobs; unfinished jobs are skipped.
         references: returns from `run_references`.
         path: path of the file. An earlier file keeps the entries of other training runs, if these runs had the same
-            settings of training and evaluation, and learned from the same histories.
+            training settings and numbers of tasks, and learned from the same histories.
     """
-    stay, expert = (references[TEAMMATE_TRACK][name]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
+    stay, reference = (references[TEAMMATE_TRACK][name]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
     options, dataset, runs = jobs[0].options, load_icrl4aht(jobs[0].options.root), []
-    hashes = {source: histories_hash(dataset.index, source) for source in {job.source for job in jobs}}
     for job in (job for job in jobs if job.is_finished()):
         learner, result = LEARNERS[job.learner], job.result()
         returns = result["returns"]
@@ -227,10 +240,10 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
             "method": learner.method.upper(),
             "labels": learner.labels or "own",
             "seed": job.seed,
-            "histories_sha256": hashes[job.source],
+            "histories_sha256": job.settings["histories_sha256"],
             "minutes": result["minutes"],
         }
-        share = (returns[TEAMMATE_TRACK]["all"] - stay) / (expert - stay)
+        share = (returns[TEAMMATE_TRACK]["all"] - stay) / (reference - stay)
         runs.append(
             entry
             | {
@@ -246,24 +259,23 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
         "tasks": {name: len(tasks) for name, tasks in options.tasks.items()},
         "references": references[PREFERENCE],
     }
-    before = parse_json(read_text(path)) if path.is_file() else {}
+    before = read_json(path) if path.is_file() else {}
     if all(before.get(name) == content[name] for name in ("training", "tasks")):
         earlier = runs_on(dataset.index, before.get("runs", []))
         runs = [*{tuple(one[name] for name in RUN_KEY): one for one in (*earlier, *runs)}.values()]
     runs.sort(key=lambda one: [one[name] for name in RUN_KEY])
-    with atomic_write(path) as partial:
-        write_json(partial, content | {"runs": runs})
+    write_json(path, content | {"runs": runs})
     return path
 
 
 def run_references(options: ProofOptions, out: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Return set of tasks -> name of an ego in `COMPARED_EGOS` -> block of episodes -> mean return.
+    """Return track -> name of an ego in `COMPARED_EGOS` -> block of episodes -> mean return.
 
     Stored results are reused.
     """
     found: dict[str, dict[str, dict[str, float]]] = {}
-    for of_set, names in COMPARED_EGOS.items():
+    for track, names in COMPARED_EGOS.items():
         for name in names:
-            folder = out / "references" / name / of_set
-            found.setdefault(of_set, {})[name] = _mean_returns(find_agent(name), of_set, options.tasks[of_set], folder)
+            folder = out / "references" / name / track
+            found.setdefault(track, {})[name] = _mean_returns(find_agent(name), track, options.tasks[track], folder)
     return found

@@ -52,7 +52,7 @@ from icrl4aht_data.benchmark.facts import ALL_TRACKS, KEPT_STEPS, TRACKS
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import process_lock
+from icrl4aht_data.utils.files import process_lock, short_hash
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import fill_template, markdown_table
 from icrl4aht_data.writing.combine import combine_releases
@@ -302,7 +302,11 @@ class ReferenceJob(TrainingJob):
 
     def teacher_histories(self) -> Path:
         """Record histories of the teacher, with noise as in `RL2_HISTORIES`. Return the folder of the release."""
-        folder = self.out / "-".join(["agent", self.track, *([Path(self.teacher).name] if self.teacher else [])])
+        parts = ["agent", self.track]
+        if self.teacher:  # run folders of different teachers may have equal names
+            path = Path(self.teacher)
+            parts += [path.name, *([short_hash(str(path.resolve()).encode(), 8)] if path.is_dir() else [])]
+        folder = self.out / "-".join(parts)
         with process_lock(folder.with_name(f".{folder.name}.recording.lock")):
             if not folder.is_dir():
                 collect_release(

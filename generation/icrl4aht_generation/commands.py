@@ -31,7 +31,7 @@ from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import plot_layouts, save_figure
-from icrl4aht_data.utils.files import atomic_write, check_output
+from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import bar_updater, progress_bars
 from icrl4aht_data.utils.text import card_file
 from icrl4aht_generation.jobs.options import queue_options, read_queue_options
@@ -286,8 +286,7 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
                 raise TaskFormatError(f"{path}: the file's tasks differ from the tasks of this version; {remedy}")
         if not check:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_write(path) as partial:
-                write_tasks(partial, tasks)
+            write_tasks(path, tasks)
         console.print(f"{path}: {len(tasks)} tasks")
 
 
@@ -317,7 +316,7 @@ _suite_option = click.option(
 @_layouts_option("all training layouts")
 @click.option(
     "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=NewFile(),
     metavar="FILE",
     help="Write the table here.",
     show_default="the package's file",
@@ -380,7 +379,7 @@ def teammates(
     options = read_queue_options(queue)
     profile = _profile_with_threads(profile_name, xla_threads)
     if layouts:
-        wanted = dict.fromkeys((get_layout(name).name for name in layouts), algorithms)
+        wanted = dict.fromkeys((get_layout(name).name for name in layouts), tuple(dict.fromkeys(algorithms)))
     else:
         available = profile.algorithms or dict.fromkeys(profile.layouts, ALGORITHMS)
         wanted = {layout: [name for name in names if name in algorithms] for layout, names in available.items()}

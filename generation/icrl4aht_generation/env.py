@@ -89,9 +89,7 @@ class Environment:
         """Tables of the environment's layout, or stacked tables of all its layouts."""
         if isinstance(self.layout, Tables):
             return self.layout
-        if not isinstance(self.layout, Layout):
-            return stack_tables(self.layout)
-        return self.layout.tables
+        return self.layout.tables if isinstance(self.layout, Layout) else stack_tables(self.layout)
 
     @property
     def only_layout(self) -> Layout:

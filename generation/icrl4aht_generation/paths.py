@@ -376,12 +376,9 @@ class Scene:
 
         If no cell is free, return `stay`, or a move towards an adjacent partner if `stay_score` > 100.
         """
-        target = jnp.asarray(self.tables.moves)[self.own_cell].astype(jnp.int32)
         # As in the published code, pushing costs 100, so a `stay_score` above 100 prefers pushing to staying.
-        scores = [
-            jnp.where(target[a] == self.own_cell, 1000, 100 * (target[a] == self.partner_cell)) for a in SEARCH_ORDER
-        ]
-        best = jnp.argmin(jnp.stack([*scores, jnp.asarray(stay_score)]))
+        scores = jnp.where(self.move_cells == self.own_cell, 1000, 100 * (self.move_cells == self.partner_cell))
+        best = jnp.argmin(jnp.append(scores, stay_score))
         return jnp.asarray((*SEARCH_ORDER, STAY))[best]
 
     def destination(self, action: Int[Array, ""]) -> Int[Array, ""]:

@@ -13,7 +13,7 @@ from typing import Any
 
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
-from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.files import read_json
 from icrl4aht_data.utils.text import card_file, markdown_table
 
 EGO_KINDS = ("informed", "episodic")
@@ -32,7 +32,7 @@ of the same name has the returns as a table."""
 def read_adaptation(folder: Path) -> list[dict[str, Any]]:
     """Return the entries of a folder's file `ADAPTATION`; an empty list if the file does not exist."""
     path = folder / ADAPTATION
-    return parse_json(read_text(path)) if path.is_file() else []
+    return read_json(path) if path.is_file() else []
 
 
 def task_set_name(track: str, split: str, layout: str, families: Iterable[str] = ()) -> str:

@@ -31,7 +31,7 @@ from icrl4aht_data.benchmark.facts import (
 )
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, check_choice, unknown_name
 from icrl4aht_data.overcooked.layouts import Layout, get_layout, with_recipes
-from icrl4aht_data.utils.files import is_safe_path, json_hash, parse_json, read_lines
+from icrl4aht_data.utils.files import is_safe_path, json_hash, parse_json, read_lines, write_atomically
 
 Dish = tuple[int, int, int]
 """Ids of the three ingredients of a dish."""
@@ -203,8 +203,8 @@ def read_tasks(path: Path) -> list[Task]:
 
 
 def write_tasks(path: Path, tasks: Iterable[Task]) -> None:
-    """Write tasks to a JSONL file, one line per task."""
-    path.write_text("".join(json.dumps(task_fields(task)) + "\n" for task in tasks), encoding="utf-8")
+    """Write tasks to a JSONL file atomically, one line per task."""
+    write_atomically(path, "".join(json.dumps(task_fields(task)) + "\n" for task in tasks))
 
 
 def task_fields(task: Task) -> dict[str, Any]:

@@ -155,10 +155,8 @@ function fillChoice() {
 
 const listed = (numbers) => numbers.map((number) => number + 1).join(", ");
 
-function historyLabel({ history_id, source, split, learner, returns }) {
-  const width = Math.max(5, Math.floor(returns.length / 10));
-  const mean = (values) => (values.reduce((sum, value) => sum + value, 0) / values.length).toFixed(1);
-  const curve = `${mean(returns.slice(0, width))} \u2192 ${mean(returns.slice(-width))}`;
+function historyLabel({ history_id, source, split, learner, return_start, return_end }) {
+  const curve = `${return_start.toFixed(1)} \u2192 ${return_end.toFixed(1)}`;
   return `${history_id}: return ${curve}, ${source}, ${split}` + (learner ? `, learner ${learner}` : "");
 }
 

@@ -20,7 +20,7 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import NotStoredError, OptionError, ReleaseError
 from icrl4aht_data.fetch import Remote
 from icrl4aht_data.format.layouts_file import layout_title
-from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, episode_returns
+from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.cells import WINDOW
 from icrl4aht_data.overcooked.drawing import AGENT_COLOURS
@@ -45,7 +45,10 @@ _FILES = Path(__file__).parent
 NO_ACTION = 255
 """Placeholder action of an episode's last frame, which shows the state after the last step."""
 
-_INDEX_FIELDS = ("history_id", "task_id", "layout", "source", "split", "track", "learner", "episodes", "expert_return")
+_INDEX_FIELDS = (
+    *("history_id", "task_id", "layout", "source", "split", "learner", "episodes", "expert_return"),
+    *("return_start", "return_end"),
+)
 
 
 class EmbeddedHistory(NamedTuple):
@@ -105,8 +108,7 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
         NotStoredError: if the release has no state records.
         ReleaseError: if the release cannot be read, or has impossible states or actions.
     """
-    entry, rewards, dones = history.entry, history.read("rewards"), history.read("dones")
-    ends = np.flatnonzero(dones) + 1
+    entry, rewards, ends = history.entry, history.read("rewards"), history.episode_ends
     _require(history, len(ends) == entry.episodes, f"{entry.episodes} episodes", f"{len(ends)} ends of episodes")
     starts, shown = np.concatenate([[0], ends[:-1]]), evenly_spaced_episodes(len(ends), most)
     # An episode with n steps has n + 1 frames: the last frame shows the state after the last step.
@@ -131,7 +133,7 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
     facts = {
         **{name: getattr(entry, name) for name in _INDEX_FIELDS},
         "steps": entry.T,
-        "returns": episode_returns(rewards, dones).tolist(),
+        "returns": history.returns().tolist(),
         "shown": shown.tolist(),
         "frames": np.diff(last, prepend=-1).tolist(),
         "columns": list(values),

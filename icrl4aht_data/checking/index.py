@@ -20,7 +20,7 @@ from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import ReleaseInfo, layout_statistics, make_info
 from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, PROVENANCE, TASKS, Entry
-from icrl4aht_data.utils.files import json_hash, parse_json, read_text, resolve_inside
+from icrl4aht_data.utils.files import json_hash, read_json, resolve_inside
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_noun
 
@@ -54,12 +54,11 @@ def check_index(
         if index.entries.matches("task_id", [task.task_id]).any():
             report.add(INFO, f"left_out: task {task.task_id!r} has histories in the index")
     _check_info(index, tasks, provenance, report)
-    shards = {entry.shard for entry in index.entries}
-    for shard in shards:
-        stem, _, _, count = shard.removesuffix(".h5").rsplit("-", 3)
+    shards = index.values("shard")
+    for stem, count in dict.fromkeys(tuple(shard.removesuffix(".h5").rsplit("-", 3)[::3]) for shard in shards):
         names = (f"{stem}-{number:05}-of-{count}.h5" for number in range(int(count)))
         for name in islice((name for name in names if name not in shards), _NAMED):
-            report.add(name, f"the name of {shard} implies this shard, but no history of the index is in it")
+            report.add(name, "names of other shards imply this shard, but no history of the index is in it")
 
 
 def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
@@ -89,7 +88,7 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
             of = f"learner {entry.learner} of " if entry.learner else ""
             report.add(HISTORIES, f"{where} stream {entry.env_idx} of {of}its task appears twice")
         streams.add(stream)
-    for task_id in by_id.keys() - first.keys():
+    for task_id in sorted(by_id.keys() - first.keys()):
         report.add(TASKS, f"task {task_id!r} has no history")
 
 
@@ -114,7 +113,7 @@ def _check_info(index: Index, tasks: list[Task], provenance: ProvenanceByTask | 
         report.add(INFO, f"shards: expected {sorted(shards)}, found {sorted(info.shards)}")
     elif report.ok and provenance is not None:
         described = replace(described, statistics=layout_statistics(described, entries, tasks, provenance))
-    found = parse_json(read_text(resolve_inside(root, INFO)))  # read as plain JSON, to find unknown fields
+    found = read_json(resolve_inside(root, INFO))  # read as plain JSON, to find unknown fields
     for name in sorted(found.keys() - {field.name for field in fields(ReleaseInfo)}):
         report.add(INFO, f"{name}: an unknown field")
     for name, expected in described.to_json().items():
@@ -133,7 +132,7 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
     """
     members = grouped(index.entries, lambda entry: entry.task_id)
     seeds = {task.task_id: task.seed for task in tasks}
-    for task_id in provenance.keys() - members.keys():
+    for task_id in sorted(provenance.keys() - members.keys()):
         report.add(PROVENANCE, f"task {task_id!r}: has no history")
     for task_id, entries in members.items():
         if task_id not in provenance:

@@ -152,6 +152,7 @@ def _check_shards(
     local = ReleaseLocation(index.root)  # a local location downloads nothing; missing files are already reported
     members = grouped(index.entries, lambda entry: entry.shard)
     total = sum(len(members[name]) for name in shards)
+    contents: dict[tuple[str, bytes], int] = {}
     for name in shards:
         entries = members[name]
         try:
@@ -162,7 +163,6 @@ def _check_shards(
         for fault in check_structure(shard, values=report.level == "deep"):
             report.add(name, fault)
         damaged = check_chunks(shard, report)
-        contents: dict[tuple[str, bytes], int] = {}
         for entry in entries:
             if entry.history_id not in damaged:
                 layout = layouts.get(entry.task_id) or get_layout(entry.layout)

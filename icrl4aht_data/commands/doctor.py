@@ -119,7 +119,9 @@ def _devices(problems: Problems) -> dict[str, Any]:
             if backend == "cpu" and shutil.which("nvidia-smi"):
                 facts["note"] = f"JAX sees no GPU: on a machine with one, `{install_command('cuda13')}`, or cuda12"
         except (OSError, ValueError, subprocess.SubprocessError) as error:
-            reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines()[-1]
+            # `stderr` of a timeout has no message about the timeout.
+            said = error.stderr.strip() if isinstance(error, subprocess.CalledProcessError) else ""
+            reason = (said or str(error)).splitlines()[-1]
             problems[f"JAX cannot be used: {reason}"] = "pip install -U --force-reinstall jax jaxlib"
     return facts
 

@@ -137,7 +137,7 @@ quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print problems 
 _FILTERS: dict[str, tuple[click.ParamType, str | None, str]] = {
     "layout": (RELEASE_LAYOUT, None, "Only this layout; repeat the option for more."),
     "split": (SPLIT, None, "Only this split: train, validation, test or heldout."),
-    "track": (TRACK, None, "Only this track: teammate or layout."),
+    "track": (TRACK, None, "Only this track: teammate, layout or preference."),
     "teammate-family": (FAMILY, None, "Only this family: rl (learned), H1, H2, H3 or H4."),
     "teammate-kind": (click.STRING, "KIND", "Only this kind, such as utility_greedy or fcp."),
     "source": (click.STRING, "NAME", "Only histories of this source: ppo, noise, agent, search or human."),

@@ -170,7 +170,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         T: number of steps.
         obs_shape: shape (5, 5, C) of one observation.
         action_dim: number of actions.
-        track: "teammate" or "layout".
+        track: "teammate", "layout" or "preference".
         split: a name in `facts.SPLITS`.
         layout: the layout's short name.
         teammate_family: "rl" or "H1".."H4".

@@ -39,7 +39,7 @@ def _delivery_fault(layout: Layout) -> str | None:
         return np.any(reach & fixtures, axis=1)
 
     def agents_that_can_get(agents: np.ndarray) -> np.ndarray:
-        """Return a mask, bool (2,), of the agents that can get an item, given a mask of those that can take it."""
+        """Return a mask, bool (2,): `agents` that can take an item, or both agents if they share counters."""
         return agents | (counters and agents.any())
 
     for kind, what in _NEEDED.items():

@@ -109,9 +109,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         self.queries = check_int("queries", queries, 1)
         super().__init__(dataset, batch_size=batch_size, length=context, **options)
         check_choice("order", order, CONTEXT_ORDERS)
-        # A curriculum's part of a history changes linearly: it is shortest at batch 0 or at the end, here batch 2**62.
-        ranges = (map(self._count_transitions, self._draws.steps(i)) for i in (0, 2**62))
-        shortest = min(int((high - low).min()) for low, high in ranges)
+        shortest = int(self._count_transitions(self._draws.fewest_steps()).min())
         if (self.length if order == "contiguous" else 1) > shortest:
             raise OptionError(
                 f"context = {context}: the shortest history has {shortest} transitions to draw from; choose a smaller "
@@ -199,9 +197,12 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
 
         low, high = self._draws.steps(i)
         members, begins, ends = self._histories_by_task
-        task = scale_to_range(for_task, len(begins))
         weights = self._draws.history_weights(low, high)
-        weights = None if weights is None else weights[members]
+        if weights is not None:
+            weights = weights[members]
+            drawn_tasks = np.logical_or.reduceat(weights > 0, begins)
+            begins, ends = begins[drawn_tasks], ends[drawn_tasks]
+        task = scale_to_range(for_task, len(begins))
         query, context = (
             members[weighted_choice(number, weights, begins[task], ends[task])] for number in (for_query, for_context)
         )

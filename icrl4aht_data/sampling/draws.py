@@ -148,6 +148,16 @@ class HistoryDraws:
         # A range up to the last episode includes the last episode's steps even if the episode is unfinished.
         return first * self.kept_steps, np.where(stop == self._counts, self.lengths, stop * self.kept_steps)
 
+    def fewest_steps(self) -> np.ndarray:
+        """Return the number of steps in each history's range, int64 (H,); with a curriculum, a lower bound for it."""
+        low, high = self.steps(0)
+        if self.curriculum is None:
+            return high - low
+        first, stop = self._range
+        # The part of a history that a curriculum selects grows or shrinks linearly.
+        share = min(high - low for low, high in (self.curriculum.first, self.curriculum.last))
+        return self.kept_steps * np.maximum(np.ceil(share * (stop - first) - 1e-9).astype(np.int64), 1)
+
     def history_weights(self, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
         """Return the histories' weights for ranges of steps low..high, float64 (H,); None for equal weights."""
         if isinstance(self.weights, str):

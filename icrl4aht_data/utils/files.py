@@ -122,9 +122,22 @@ def parse_json(text: str) -> Any:
     raise IndexFormatError(f"expected JSON of at most {_DEPTH} levels, found more")
 
 
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        IndexFormatError: as `read_text` and `parse_json`; the message has the path.
+    """
+    text = read_text(path)
+    try:
+        return parse_json(text)
+    except IndexFormatError as error:
+        raise IndexFormatError(f"{path}: {error}") from error
+
+
 def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
-    """Write a JSON file, indented or on one line."""
-    path.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
+    """Write a JSON file atomically, indented or on one line."""
+    write_atomically(path, json.dumps(content, indent=indent) + "\n")
 
 
 def file_hash(path: Path) -> str:
@@ -320,6 +333,7 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
 
 def lock_file_path(folder: Path) -> Path:
     """Return the path of a folder's lock file, which is next to the folder, so that a locked folder can be renamed."""
+    folder = folder.resolve()  # "." has no name
     return folder.with_name(f".{folder.name}.lock")
 
 

@@ -1,6 +1,6 @@
 """Mean returns of models that were trained on one release only, for the dataset card of this release.
 
-`icrl4aht-data research proof` measures the returns on validation tasks and stores them in `cards/proof.json`.
+`icrl4aht-data research proof --bundle` measures the returns on validation tasks and writes `cards/proof.json`.
 """
 
 from __future__ import annotations
@@ -11,17 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from icrl4aht_data.benchmark.facts import SOURCES
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import Index, read_index
-from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.files import read_json
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import card_file, markdown_table
 
 PROOF_FILE = "proof.json"
 
 RUN_KEY = ("histories", "method", "labels", "seed")
-"""Fields that identify a training run in the file."""
+"""Fields that identify a training run in `PROOF_FILE`."""
 
 _COLUMNS = {
     "first": "episode 1",
@@ -39,10 +38,7 @@ def read_proof(root: Path) -> dict[str, Any] | None:
     Args:
         root: folder of the release.
     """
-    try:
-        content = parse_json(read_text(card_file(PROOF_FILE)))
-    except OptionError:  # the file has not been made yet
-        return None
+    content = read_json(card_file(PROOF_FILE))
     runs = runs_on(read_index(root), content["runs"])
     return content | {"runs": runs, "trainings": [len(own) for own in _runs_by_row(runs).values()]} if runs else None
 
@@ -78,7 +74,7 @@ def histories_hash(index: Index, source: str) -> str:
 def proof_table(proof: Mapping[str, Any]) -> str:
     """Return a Markdown table of models, their training histories, and their mean returns (lowest..highest run).
 
-    In the first episode the memory is empty, so clearing it changes nothing.
+    Episode 1 has no column for cleared memory, because the memory is empty in this episode.
     """
     rows = [
         [*row, *(_mean_text([one[key] for one in own], key) for key in _COLUMNS)]

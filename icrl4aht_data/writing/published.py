@@ -331,8 +331,6 @@ class _PublishedHistory:
             PublishedFormatError: if the array is invalid; the message has its name and the expected and found values.
         """
         layout, steps = get_layout(self.line["layout"]), self.line["T"]
-        if name == "obs" and self.needs_padding and self.kind != OBSERVATIONS:  # states show all cells, so no padding
-            return fast_observe(layout, self.read("state"), np.empty((steps, *layout.obs_shape), np.uint8))
         array = self._read_recorded(name)
         if name == "obs" and self.needs_padding:
             try:

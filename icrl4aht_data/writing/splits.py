@@ -11,9 +11,8 @@ from collections.abc import Iterable, Sequence
 import msgspec
 
 from icrl4aht_data.benchmark.tasks import Task, teammate_id
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.provenance import ProvenanceByTask
-from icrl4aht_data.utils.files import json_hash, parse_json, read_text
+from icrl4aht_data.utils.files import json_hash, read_json
 from icrl4aht_data.utils.text import card_file
 
 DISTANCES_FILE = "split_distances.json"
@@ -49,10 +48,7 @@ def teammates_hash(played: Sequence[Task]) -> str:
 
 def read_distances(played: Sequence[Task]) -> dict[str, SplitDistance]:
     """Return the distances in `cards/split_distances.json` by layout; empty if the file is for other teammates."""
-    try:
-        content = parse_json(read_text(card_file(DISTANCES_FILE)))
-    except OptionError:  # the file has not been made yet
-        return {}
+    content = read_json(card_file(DISTANCES_FILE))
     if content["teammates"] != teammates_hash(played):
         return {}
     return msgspec.convert(content["layouts"], dict[str, SplitDistance])

@@ -96,13 +96,13 @@ def test_dataset_card_shows_only_results_of_models_trained_on_its_release(releas
     stored.write_text(json.dumps(content))
     assert read_proof(release) == content | {"trainings": [1]}
     card = render_card(card_facts(release))
-    assert "## What it teaches" in card and "minutes on one core: 1; trainings of each row: 1" in card
+    assert "## What models learn from it" in card and "minutes on one core: 1; runs of each row: 1" in card
     other = run | {"histories_sha256": "0"}
     stored.write_text(json.dumps(content | {"runs": [other, run]}))
     assert read_proof(release) == content | {"trainings": [1]}
     stored.write_text(json.dumps(content | {"runs": [other]}))
     assert read_proof(release) is None
-    assert "## What it teaches" not in render_card(card_facts(release))
+    assert "## What models learn from it" not in render_card(card_facts(release))
 
 
 @pytest.mark.slow

@@ -120,6 +120,18 @@ def test_model_of_all_tracks_is_evaluated_on_all_tracks(tmp_path):
     assert {task.track for task in ReferenceJob("x", "layout", 0, tmp_path).evaluation_tasks("test")} == {"layout"}
 
 
+def test_histories_of_teachers_with_equal_folder_names_are_recorded_separately(tmp_path, monkeypatch):
+    recorded: list[Path] = []
+    monkeypatch.setattr(reference, "find_agent", lambda teacher, greedy: teacher)
+    monkeypatch.setattr(ReferenceJob, "teammates", lambda job: ())
+    monkeypatch.setattr(reference, "collect_release", lambda *options: recorded.append(options[-1]))
+    teachers = ["rl2-reference", *(str(tmp_path / seed / "run") for seed in ("s0", "s1"))]
+    for teacher in teachers[1:]:
+        Path(teacher).mkdir(parents=True)
+    found = [ReferenceJob("ad-reference", "layout", 0, tmp_path, teacher).teacher_histories() for teacher in teachers]
+    assert found == recorded and len({*found}) == 3 and found[0].name == "agent-layout-rl2-reference"
+
+
 @pytest.fixture
 def tiny_training_settings(monkeypatch, tmp_path) -> Path:
     """Use tiny settings, one layout, few tasks, and a part of the bundled release as training data."""

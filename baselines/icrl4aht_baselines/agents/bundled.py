@@ -23,7 +23,7 @@ from icrl4aht_data.benchmark.facts import TRACKS, layout_track
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.fetch import is_address
 from icrl4aht_data.format.layouts_file import LAYOUTS_NAME
-from icrl4aht_data.utils.files import parse_json, read_text, write_json
+from icrl4aht_data.utils.files import read_json, write_json
 from icrl4aht_data.utils.text import listed_names
 
 MODELS = Path(__file__).parents[1] / "models"
@@ -70,7 +70,7 @@ def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
     for path in sorted(folder.glob("*/")):
         runs = {track: path / track for track in (*TRACKS, EVERY_TRACK) if (path / track / CONFIG).is_file()}
         if runs:
-            found[path.name] = BundledModel(path.name, runs, **parse_json(read_text(path / BUNDLE)))
+            found[path.name] = BundledModel(path.name, runs, **read_json(path / BUNDLE))
     return found
 
 

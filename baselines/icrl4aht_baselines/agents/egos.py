@@ -19,6 +19,7 @@ from icrl4aht_baselines.methods.tokens import input_step
 from icrl4aht_baselines.methods.view_change import no_change
 from icrl4aht_baselines.training.histories import TrainedModel, read_trained
 from icrl4aht_baselines.training.run_folder import CONFIG
+from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_data.errors import OptionError, UnknownNameError, check_choice, unknown_name
 from icrl4aht_data.overcooked.actions import ACTIONS, STAY
 from icrl4aht_data.overcooked.channels import Channels
@@ -143,7 +144,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
     if model is None:
         run = read_trained(Path(name))
         details = {"run": run.hash, "step": run.step, "context": run.context, "encoder": run.encoder, **mode.details}
-        details["trained_on"] = run.trained_on
+        details[TRAINED_ON] = run.trained_on
         return NamedEgo(run.label + suffix, trained_ego(run, mode, name), details, Path(name))
     runs = {track: read_trained(folder) for track, folder in model.runs.items()}
     egos = {track: trained_ego(run, mode, str(model.runs[track])) for track, run in runs.items()}
@@ -160,7 +161,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
     hashes = {track: run.hash for track, run in runs.items()}
     trained_on = {track: run.trained_on for track, run in runs.items()}
     details = {"model": name, "run": hashes.get(EVERY_TRACK, hashes), **mode.details}
-    details["trained_on"] = trained_on.get(EVERY_TRACK, trained_on)
+    details[TRAINED_ON] = trained_on.get(EVERY_TRACK, trained_on)
     return NamedEgo(name + suffix, make_ego, details)
 
 

@@ -19,7 +19,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
 from icrl4aht_data.commands.options import COUNT, Folder, Names, examples
 from icrl4aht_data.errors import EmptySelectionError
-from icrl4aht_data.utils.files import check_output, parse_json, read_text
+from icrl4aht_data.utils.files import check_output, read_json
 from icrl4aht_data.utils.options import replace_options
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.text import card_file
@@ -55,7 +55,8 @@ def _queue_command(out: str, card: str) -> Callable[[Callable[..., _Queued]], Ca
             from rich.console import Console
 
             limit_xla_threads(1)  # as many threads as in workers: jobs resume only with an equal number
-            jobs, write, table = command(out=out, **choice)
+            # The path is absolute, as workers on a cluster have other working directories.
+            jobs, write, table = command(out=out.resolve(), **choice)
             console = Console(soft_wrap=True)
             try:
                 run_jobs(jobs, out, console, options)
@@ -132,11 +133,11 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
 
 
 def _model_returns() -> dict[str, dict[str, Any]]:
-    """Return model -> task id -> mean return on test tasks with each of `REPORT_SEEDS`, from the stored results.
+    """Return model -> task id -> mean return on test tasks with each of `SUBMITTED_SEEDS`, from the stored results.
 
     Results of controls, in which an ego's memory is cleared or another teammate plays, are left out.
     """
-    from icrl4aht_baselines.online.responses import REPORT_SEEDS
+    from icrl4aht_baselines.evaluate.protocols import SUBMITTED_SEEDS
     from icrl4aht_baselines.report.results import bundled_tasks_by_id, task_label
     from icrl4aht_baselines.report.stored_results import read_stored, results_file
 
@@ -146,7 +147,7 @@ def _model_returns() -> dict[str, dict[str, Any]]:
         agent: {
             ids[task]: values
             for of in cells.values()
-            if of.seeds == REPORT_SEEDS
+            if of.seeds == SUBMITTED_SEEDS
             for task, values in zip(of.tasks, of.mean, strict=True)
         }
         for agent, cells in stored.with_other_play_modes(stored.returns()).items()
@@ -271,8 +272,8 @@ def proof_command(root: Any, histories: tuple[str, ...], learner: tuple[str, ...
 
     Trains small AD and DPT models on the release only, and evaluates them on validation tasks. On track `preference`
     each model also plays with its memory cleared before each episode. On track `teammate` the models are compared
-    with rl2-reference. Training and evaluating a model takes about 30 minutes on one core. Writes OUT/proof.json, which
-    the release's card shows. Finished runs are reused, and stopped runs resume.
+    with rl2-reference. Training and evaluating a model takes about 30 minutes on one core. Writes OUT/proof.json;
+    with --bundle the card of the bundled release shows the results. Finished runs are reused, and stopped runs resume.
     """
     from icrl4aht_baselines.proof import LEARNERS, ProofJob, ProofOptions, run_references, write_proof
 
@@ -282,6 +283,6 @@ def proof_command(root: Any, histories: tuple[str, ...], learner: tuple[str, ...
     references = run_references(chosen, out)
 
     def format_table(folder: Path) -> str:
-        return proof_table(parse_json(read_text(folder / PROOF_FILE)))
+        return proof_table(read_json(folder / PROOF_FILE))
 
     return jobs, lambda folder: write_proof(jobs, references, folder / PROOF_FILE), format_table

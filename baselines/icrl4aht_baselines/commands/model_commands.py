@@ -65,7 +65,7 @@ from icrl4aht_data.utils.text import counted_noun
 )
 @click.option(
     "--number",
-    type=click.IntRange(0, 99),
+    type=click.IntRange(0, 19),
     default=0,
     help="Number of the collection. Releases with different numbers have different tasks, so they can be combined.",
 )
@@ -201,6 +201,7 @@ def reference_command(
         find_agent(teacher)
         for name in names:
             check_learns_from_teacher(name)
+    out = out.resolve()  # workers on a cluster have other working directories
     threads = 1 if options.workers or options.executor == "ray" else None  # a single job may use all cores
     jobs = [
         ReferenceJob(name, of_track, seed, out, teacher, threads)

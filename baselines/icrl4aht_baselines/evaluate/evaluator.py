@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -123,10 +124,11 @@ def evaluate(
     with progress_bars(quiet=played is not None, unit="episodes") as show:
         played = played or bar_updater(show, f"{agent}, {rules.name}", len(tasks) * len(seeds) * rules.episodes)
         played(len(results) * len(seeds) * rules.episodes)
-        for result in evaluation.play(missing, played):
-            results[result.task_id] = result
-            if out is not None:
-                write_result(out, result)
+        with closing(evaluation.play(missing, played)) as found:  # an error while writing stops all queued groups
+            for result in found:
+                results[result.task_id] = result
+                if out is not None:
+                    write_result(out, result)
     return [results[task.task_id] for task in tasks]
 
 
@@ -151,7 +153,7 @@ class _Evaluation:
     settings: dict[str, Any]
     programs: ProgramCache
 
-    def play(self, planned: Sequence[PlannedTask], played: Callable[[int], None]) -> Iterator[Result]:
+    def play(self, planned: Sequence[PlannedTask], played: Callable[[int], None]) -> Generator[Result, None, None]:
         """Yield the results of each group of tasks that share compiled programs, as soon as the group is finished."""
         layouts = dict.fromkeys(task.layout for plan in planned for task in plan.played)
         egos = {layout: self.make_ego(layout) for layout in layouts}

@@ -136,8 +136,8 @@ def hidden_recipe_note(tasks: Sequence[Task]) -> str:
     if not hidden:
         return ""
     names = ", ".join(dict.fromkeys(task.layout.name for task in hidden))
-    fixed = " In tasks with one dish throughout, it can remember what was paid." if hidden[0].recipes else ""
-    return f"no observation shows the wanted dish on {names}: an ego has to find it out from what is paid.{fixed}"
+    fixed = " In tasks with one dish throughout, it can remember what was rewarded." if hidden[0].recipes else ""
+    return f"no observation shows the wanted dish on {names}: an ego has to find it out from rewards.{fixed}"
 
 
 def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
@@ -156,6 +156,9 @@ def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
 
 
 Control = Literal["cleared", "swapped"]
+SUBMITTED_SEEDS = (0, 1, 2)
+"""Seeds that every task of a submission must be played with; best responses are reported with the same seeds."""
+
 CONTROLS: dict[Control, str] = {"cleared": "forget", "swapped": "swapped"}
 """Name of a control -> key that marks its results in their `details`. `cleared`: the ego's memory is cleared before
 each episode. `swapped`: another task's teammate plays all episodes but the last, see `Protocol.last_episodes`."""

@@ -143,9 +143,6 @@ class RenumberedLayoutSampler:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._sampler, name)
 
-    def __getitem__(self, i: int) -> Any:
-        return self.batch(i)
-
     def batch(self, i: int, out: Any = None) -> Any:
         """Return batch number i, written into `out` if given."""
         batch = self._sampler.batch(i, out)

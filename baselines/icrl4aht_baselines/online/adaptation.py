@@ -29,7 +29,7 @@ from icrl4aht_data.benchmark.best_responses import BestResponse, TrainingRun
 from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write, json_hash, write_atomically, write_json
+from icrl4aht_data.utils.files import json_hash, write_atomically, write_json
 from icrl4aht_data.utils.groups import grouped
 
 MEASURED_EPISODES = 100
@@ -221,8 +221,7 @@ def write_adaptation(jobs: Sequence[AdaptationJob], folder: Path) -> Path:
     for title in dict.fromkeys(job.title for job in jobs if job.kind in EGO_KINDS):
         if entry := adaptation_entry(title, jobs):
             known[title] = _with_stored_seeds(entry, known.get(title, entry))
-    with atomic_write(path) as partial:
-        write_json(partial, list(known.values()))
+    write_json(path, list(known.values()))
     write_atomically(path.with_suffix(".md"), f"# Adaptation headroom\n\n{adaptation_table(known.values())}\n")
     return path
 

@@ -48,7 +48,7 @@ from icrl4aht_data.format.provenance import ExpertLabels, LabelView, Provenance,
 from icrl4aht_data.format.schema import TEAMMATES, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import read_json, write_json
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.progress import bar_updater
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
@@ -323,10 +323,9 @@ def collect_release(
         "code_version": version("icrl4aht-data"),
     }
     if (begun := parts / "settings.json").exists():
-        check_same_settings(parse_json(read_text(begun)), settings, f"{parts}: holds parts")
+        check_same_settings(read_json(begun), settings, f"{parts}: holds parts")
     parts.mkdir(parents=True, exist_ok=True)
-    with atomic_write(begun) as partial:
-        write_json(partial, settings)
+    write_json(begun, settings)
     total = len(teammates.tasks) * config.histories * config.episodes
     show, label = bar_updater(progress, f"{agent.name}: episodes", total), labeller and labeller.make
     by = f"{agent.name}, before the noise" if labeller is None else f"{labeller.name}, in histories of {agent.name}"

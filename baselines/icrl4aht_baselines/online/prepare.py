@@ -24,7 +24,7 @@ from icrl4aht_baselines.training.histories import (
     training_record_entry,
 )
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
-from icrl4aht_baselines.training.seen import TASKS_SOURCE
+from icrl4aht_baselines.training.seen import TASKS_SOURCE, TRAINED_ON
 from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.benchmark.tasks import Task, teammate_id
@@ -104,7 +104,7 @@ def prepare_play(
             "groups": dict(Counter(task.name for task in played)),
             "searched": sorted({task.label for task in played if task.searched}),
         },
-        "trained_on": _training_record(dataset, tasks, {task.id for task in played}, labels),
+        TRAINED_ON: _training_record(dataset, tasks, {task.id for task in played}, labels),
     }
     trainer = PlayTrainer(method, options, play, played, histories.mirror)
     return TrainingTask(method, TrainingData(None, {}), options, about, trainer)
@@ -113,7 +113,7 @@ def prepare_play(
 def _check_unused(name: str, histories: HistoryOptions) -> None:
     # Ignored options are refused, because they would be stored and make equal runs look different in tables.
     default = HistoryOptions(histories.layouts)
-    for field in ("order", "queries", "labels", "every", "held_out"):
+    for field in ("order", "queries", "labels", "every", "first", "held_out"):
         found = getattr(histories, field)
         if found != getattr(default, field):
             raise OptionError(f"{field} = {found}: {name} learns by playing, not from histories; leave out this option")

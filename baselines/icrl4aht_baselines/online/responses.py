@@ -26,7 +26,7 @@ from msgspec import structs, to_builtins
 from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import PlayMode, trained_policy, with_channels
 from icrl4aht_baselines.evaluate.evaluator import evaluate
-from icrl4aht_baselines.evaluate.protocols import bundled_tasks
+from icrl4aht_baselines.evaluate.protocols import SUBMITTED_SEEDS, bundled_tasks
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTask, PlayTrainer
@@ -53,8 +53,8 @@ from icrl4aht_data.utils.text import counted_noun, markdown_table
 PROTOCOL = "seeded"
 """Protocol under which best responses are chosen and measured."""
 
-CHOICE_SEEDS, REPORT_SEEDS = (1000,), (0, 1, 2)
-"""Seeds of the episodes that the best training run is chosen by, and seeds of the reported episodes."""
+CHOICE_SEEDS = (1000,)
+"""Seeds of the episodes that the best training run is chosen by; `SUBMITTED_SEEDS` are those of reported episodes."""
 
 RESPONSES_FILE = "best_responses.json"
 """Name of the file of best responses, in a folder of training runs and among the package's cards."""
@@ -64,7 +64,7 @@ ABOUT = (
     "cleared before each episode, and imitates the oracle in the first half of the training. Some runs start from the "
     "parameters of a bundled model. Episodes of seed "
     f"{CHOICE_SEEDS[0]} decide between training runs. Returns are means over tasks and the seeds "
-    f"{', '.join(map(str, REPORT_SEEDS))}. For each of these seeds, the stored model that earns most with the other "
+    f"{', '.join(map(str, SUBMITTED_SEEDS))}. For each of these seeds, the stored model that earns most with the other "
     "two is used instead if it earns more with them; in validation tasks, models are not compared. On the track "
     "`preference`, best responses are informed egos, which observe the task's number, and returns are means over "
     "training runs."
@@ -195,7 +195,7 @@ class ResponseJob(EgoJob):
     @property
     def settings(self) -> dict[str, Any]:
         """All settings that the result depends on, as JSON."""
-        seeds = {"choice_seeds": list(CHOICE_SEEDS), "report_seeds": list(REPORT_SEEDS), "protocol": PROTOCOL}
+        seeds = {"choice_seeds": list(CHOICE_SEEDS), "report_seeds": list(SUBMITTED_SEEDS), "protocol": PROTOCOL}
         return {"tasks": [task.task_id for task in self.tasks], **super().settings, **seeds}
 
     def finished_text(self) -> str:
@@ -207,7 +207,7 @@ class ResponseJob(EgoJob):
         """Train the ego, and measure its returns in episodes with other seeds than in training.
 
         "choice" is the mean return over the tasks in episodes with `CHOICE_SEEDS`, "return" in episodes with
-        `REPORT_SEEDS`. Each is measured with the most probable actions ("greedy") and with sampled actions ("sampled").
+        `SUBMITTED_SEEDS`. Each is measured with its most probable actions ("greedy") and with sampled ones ("sampled").
         "slope" is the training return in the last quarter of the steps minus that in the third quarter.
         """
         task, params = self.tasks[0], None
@@ -233,14 +233,14 @@ class ResponseJob(EgoJob):
         return {"modes": modes, "slope": round(slope, 3)}
 
     def _mean_returns(self, policy: Policy) -> dict[str, float]:
-        """Return the mean returns in episodes with `CHOICE_SEEDS` ("choice") and with `REPORT_SEEDS` ("return")."""
+        """Return the mean returns in episodes with `CHOICE_SEEDS` ("choice") and with `SUBMITTED_SEEDS` ("return")."""
         # The memory is cleared before each episode, as it was in training.
         results = evaluate(
             "best response",
             lambda layout: policy,
             self.tasks,
             PROTOCOL,
-            seeds=(*CHOICE_SEEDS, *REPORT_SEEDS),  # together, because each number of seeds is compiled separately
+            seeds=(*CHOICE_SEEDS, *SUBMITTED_SEEDS),  # together, because each number of seeds is compiled separately
             control="cleared",
             played=lambda count: None,
         )
@@ -269,7 +269,7 @@ def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainingRun]
     """Return the best response to tasks whose teammates behave the same, from several training runs.
 
     The run with the highest mean return in episodes with the seeds `CHOICE_SEEDS` is chosen. The result's field `best`
-    is the mean return of this run in other episodes, with the seeds `REPORT_SEEDS`. For informed egos, which have no
+    is the mean return of this run in other episodes, with the seeds `SUBMITTED_SEEDS`. For informed egos, which have no
     returns in separate episodes, it is the mean over the runs with the most steps. Of several runs with the same seed,
     tasks, initial model, steps and width, only the last is used.
     """
@@ -299,15 +299,15 @@ def include_models(found: BestResponse, models: Mapping[str, Mapping[str, np.nda
     """Choose between the trained ego of a best response and stored models.
 
     The return of a model that is chosen by the reported episodes would be too high. Therefore an ego is chosen for each
-    seed of `REPORT_SEEDS` separately: the model with the highest mean return with the other seeds, or the trained ego
-    if its mean return over all seeds is as high. (Its returns by seed are not stored; its return with `CHOICE_SEEDS` is
-    the highest of several runs, and thus too high for a comparison.) Field `best` of the result is the mean return of
-    the chosen egos. Field `agent` is the ego that would be chosen by all seeds.
+    seed of `SUBMITTED_SEEDS` separately: the model with the highest mean return with the other seeds, or the trained
+    ego if its mean return over all seeds is as high. (Its returns by seed are not stored; its return with
+    `CHOICE_SEEDS` is the highest of several runs, and thus too high for a comparison.) Field `best` of the result is
+    the mean return of the chosen egos. Field `agent` is the ego that would be chosen by all seeds.
 
     Args:
         found: best response; its training runs are used, and its fields `best` and `agent` are replaced.
-        models: model -> task id -> mean return with each of `REPORT_SEEDS`, float64 (3,); models without results in all
-            tasks of `found` are ignored.
+        models: model -> task id -> mean return with each of `SUBMITTED_SEEDS`, float64 (3,); models without results in
+            all tasks of `found` are ignored.
     """
     trained, ego = _trained_ego(found.seeds)
     found = structs.replace(found, best=trained, agent=ego)
@@ -315,7 +315,7 @@ def include_models(found: BestResponse, models: Mapping[str, Mapping[str, np.nda
     if not names:
         return found
     earned = np.array([np.mean([models[name][task] for task in found.tasks], axis=0) for name in names])
-    others = (earned.sum(axis=1, keepdims=True) - earned) / (len(REPORT_SEEDS) - 1)  # shape (models, seeds)
+    others = (earned.sum(axis=1, keepdims=True) - earned) / (len(SUBMITTED_SEEDS) - 1)  # shape (models, seeds)
     of_models = np.take_along_axis(earned, others.argmax(axis=0)[None], axis=0)[0]
     best = np.where(others.max(axis=0) > trained, of_models, trained)
     means = earned.mean(axis=1)

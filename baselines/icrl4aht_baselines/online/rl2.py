@@ -427,10 +427,6 @@ class PlayTrainer:
         """Return the numbers of the training steps instead of batches, because `step` plays the episodes."""
         return nullcontext(range(start, stop))
 
-    def validation_lines(self, state: PlayState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
-        """Return an empty list, because online training has no validation loss; `evaluate` measures the model."""
-        return []
-
     def step(self, state: PlayState, number: int) -> tuple[PlayState, dict[str, Array]]:
         """Play the next episodes of every task and update the model. Return the new state, and the numbers to log."""
         # Random keys depend on the seed and the step only, so that a resumed run plays the same episodes.

@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.policy import Policy, on_layout
-from icrl4aht_generation.teammates.instances import INSTANCES, published_task
+from icrl4aht_generation.teammates.instances import INSTANCE_NAMES, published_task
 from icrl4aht_generation.teammates.registry import build_teammate
 
 from icrl4aht_baselines.agents.egos import agent_names, find_agent
 from icrl4aht_baselines.agents.host import EgoInput
 from icrl4aht_baselines.evaluate.rollout import EGO_STEPS, TEAMMATE_STEPS
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, LAYOUT_NAMES
+from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError, unknown_name
 from icrl4aht_data.format.schema import episode_ends
@@ -113,8 +113,7 @@ def find_partner(name: str, layout: Layout, slot: int) -> Partner:
     """
     if name == HUMAN:
         return Partner(None)
-    tests = [f"{family}/t{t}" for family in HEURISTIC_KINDS.values() for t in range(INSTANCES)]
-    if name in tests:
+    if name in INSTANCE_NAMES:
         if layout.name not in (*LAYOUT_NAMES, *LAYOUT_PLUGINS.names):
             raise OptionError(
                 f"--with {name}: test teammates play only published and registered layouts, found {layout.name}; "
@@ -124,7 +123,7 @@ def find_partner(name: str, layout: Layout, slot: int) -> Partner:
         policy = build_teammate(layout, task.teammate, slot)
         return Partner(PolicyPlayer(policy, layout, slot, is_ego=False), task)
     if name not in agent_names() and not Path(name).is_dir():
-        raise unknown_name("partner", name, (HUMAN, *agent_names(), *tests))
+        raise unknown_name("partner", name, (HUMAN, *agent_names(), *INSTANCE_NAMES))
     if slot != EGO:
         layout = _SwappedLayout(**{one.name: getattr(layout, one.name) for one in fields(Layout)})
     return Partner(PolicyPlayer(find_agent(name).make(layout), layout, slot, is_ego=True))

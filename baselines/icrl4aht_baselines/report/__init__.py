@@ -13,7 +13,7 @@ __all__ = ["as_run", "markdown", "merge", "read_run", "report", "write_report"]
 
 def report(*results: Sequence[Result]) -> str:
     """Return a Markdown report; each argument is the list of results that `evaluate` returned for one agent."""
-    return markdown(merge([as_run(of_agent) for of_agent in results]))
+    return markdown(merge([as_run(of_agent, f"results {number}") for number, of_agent in enumerate(results, 1)]))
 
 
 sys.modules[__name__].__class__ = CallablePackage

@@ -13,7 +13,6 @@ from icrl4aht_baselines.agents.egos import OTHER_WAYS
 from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.results import (
     EPISODE_BLOCKS,
-    TABLE_COLUMNS,
     TEST_LAYOUTS,
     AgentReturns,
     ResultCell,
@@ -92,9 +91,7 @@ def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
     with atomic_write(csv) as partial:
         table.to_csv(partial, index=False, lineterminator="\n")
     with atomic_write(parquet) as partial:
-        table.astype({name: "category" for name in TABLE_COLUMNS if table[name].dtype == object}).to_parquet(
-            partial, index=False
-        )
+        table.to_parquet(partial, index=False)
     return paths
 
 

@@ -22,8 +22,8 @@ from icrl4aht_baselines.report.results import (
     mean_over_cells,
     sorted_cells,
 )
-from icrl4aht_baselines.report.scores import cell_scales, find_score, scored_cells
-from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
+from icrl4aht_baselines.report.scores import cell_scales, find_score, mean_return, scored_cells
+from icrl4aht_baselines.report.statistics import MeanInterval
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.plotting import axis_limits, running_mean
@@ -129,7 +129,7 @@ def bar_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
     for kind, about in TASK_KINDS.items():
         shown = agents if kind == "test" else runs
         values = {
-            number: {cell: mean_interval(found.mean) for cell, found in run.returns.items() if cell.kind == kind}
+            number: {cell: mean_return([found]) for cell, found in run.returns.items() if cell.kind == kind}
             for number, run in shown.items()
         }
         if any(values.values()) and not (kind == "test" and charts):

@@ -45,7 +45,7 @@ from icrl4aht_baselines.report.scores import (
 from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend, overlap_marks
 from icrl4aht_data.benchmark.facts import TRACKS, family_sort_key
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
-from icrl4aht_data.utils.files import json_hash, parse_json, read_text, write_atomically
+from icrl4aht_data.utils.files import json_hash, read_json, write_atomically
 from icrl4aht_data.utils.text import card_file, counted_noun, markdown_table
 
 REPORT_FILES = ("report.md", "report.csv")
@@ -178,7 +178,7 @@ def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTa
 @cache
 def read_published() -> dict[str, Any]:
     """Return the content of cards/published.json: the numbers of the paper and their sources."""
-    return parse_json(read_text(card_file("published.json")))
+    return read_json(card_file("published.json"))
 
 
 def published_cells(agent: str) -> dict[str, dict[str, tuple[float, float]]]:

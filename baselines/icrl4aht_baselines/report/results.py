@@ -28,7 +28,7 @@ import pandas as pd
 
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo
 from icrl4aht_baselines.evaluate.evaluator import evaluate
-from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, Protocol, bundled_tasks
+from icrl4aht_baselines.evaluate.protocols import CONTROLS, EVALUATION_SPLITS, Protocol, bundled_tasks
 from icrl4aht_baselines.evaluate.results import RESULTS, Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_baselines.training.seen import (
@@ -43,7 +43,7 @@ from icrl4aht_data.benchmark.tasks import Task, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, read_tasks_and_layouts, write_layouts_file
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import json_hash, read_json, write_json
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.progress import bar_updater
 from icrl4aht_data.utils.text import counted_noun
@@ -284,16 +284,14 @@ def write_run_and_tasks(results: Path, run: Path | None = None, tasks: Sequence[
             "manifest_sha256": config["histories"]["manifest_sha256"],
             "config": config,
         }
-        with atomic_write(results / TRAINED_RUN) as partial:
-            write_json(partial, content)
+        write_json(results / TRAINED_RUN, content)
     own = {task.task_id: task for task in tasks if task.task_id not in bundled_tasks_by_id("test")}
     if own:
         path = results / OWN_TASKS
         known = {task.task_id: task for task in read_tasks_and_layouts(path)} if path.exists() else {}
         noted = [*(known | own).values()]
         write_layouts_file(results / LAYOUTS_NAME, [get_layout(task.layout_name) for task in noted])
-        with atomic_write(path) as partial:
-            write_tasks(partial, noted)
+        write_tasks(path, noted)
 
 
 def evaluate_agent(
@@ -342,7 +340,7 @@ def read_run(folder: Path) -> EvaluationRun:
         OptionError: if the folder has no results, the results have different settings, or a task is unknown.
     """
     own = read_tasks_and_layouts(folder / OWN_TASKS) if (folder / OWN_TASKS).exists() else []
-    trained = parse_json(read_text(folder / TRAINED_RUN)) if (folder / TRAINED_RUN).exists() else None
+    trained = read_json(folder / TRAINED_RUN) if (folder / TRAINED_RUN).exists() else None
     return as_run(read_results(folder), str(folder), own, trained)
 
 
@@ -373,6 +371,8 @@ def as_run(
     played = grouped(results, lambda result: cell_of(known[result.task_id]))
     seen = find_training_record(settings, where)
     agent, seeds = (settings["agent"], settings["protocol"]["name"]), settings["seeds"]
+    details = settings.get("details", {})
+    control = next((name for name, mark in CONTROLS.items() if details.get(mark)), "")
     rows, cells, tracks = [], {}, defaultdict(dict)
     for cell in sorted_cells(played):
         of_cell = tuple(known[result.task_id] for result in played[cell])
@@ -381,7 +381,7 @@ def as_run(
         cells[cell], tracks[track][cell] = returns.mean(axis=1), of_cell
         overlaps, names = find_overlaps(of_cell, seen[track]), [task_label(task.task_id) for task in of_cell]
         rows += [
-            (agent[0], 0, agent[1], "", *cell, " ".join(overlaps), name, seed, block, value)
+            (agent[0], 0, agent[1], control, *cell, " ".join(overlaps), name, seed, block, value)
             for block, values in episode_blocks(returns).items()
             for name, of_task in zip(names, values.tolist(), strict=True)
             for seed, value in zip(seeds, of_task, strict=True)

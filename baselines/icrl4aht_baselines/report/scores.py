@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from icrl4aht_baselines.evaluate.evaluator import ControlledResults
-from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks
+from icrl4aht_baselines.evaluate.protocols import CONTROLS, EVALUATION_SPLITS, bundled_tasks
 from icrl4aht_baselines.report.results import (
     EPISODE_BLOCKS,
     TASK_KINDS,
@@ -38,7 +38,6 @@ from icrl4aht_baselines.report.statistics import (
     MeanInterval,
     Stratum,
     interquartile_mean,
-    mean_interval,
     ratio_interval,
 )
 from icrl4aht_baselines.training.seen import overlap_marks
@@ -269,10 +268,8 @@ def _pooled_strata(
 def _strata_by_layout(
     cells: Sequence[ResultCell], parts: Sequence[tuple[np.ndarray, np.ndarray, list[str]]]
 ) -> list[list[Stratum]]:
-    groups: dict[str, list[Stratum]] = defaultdict(list)
-    for (layout, _), stratum in _pooled_strata(cells, parts).items():
-        groups[layout].append(stratum)
-    return [*groups.values()]
+    pooled = _pooled_strata(cells, parts)
+    return [[pooled[key] for key in keys] for keys in grouped(pooled, lambda key: key[0]).values()]
 
 
 def stratum_of_behaviours(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
@@ -292,6 +289,16 @@ def stratum_of_behaviours(values: np.ndarray, scales: np.ndarray, behaviours: Se
         return Stratum(values.sum(axis=1) / seeds, np.full(seeds, scales.sum() / seeds))
     member = np.array([[name == own for name in names] for own in behaviours], float)
     return Stratum(np.moveaxis(values.mean(axis=2)[..., None] * member, 1, -1).sum(axis=-1), scales @ member)
+
+
+def mean_return(cells: Iterable[CellReturns]) -> MeanInterval:
+    """Return the mean over result cells of an agent's mean return, with its 95 % interval."""
+    alike = behaviour_names()
+    strata = [
+        stratum_of_behaviours(of.blocks["all"], np.ones(len(of.tasks)), [alike.get(task, task) for task in of.tasks])
+        for of in cells
+    ]
+    return ratio_interval([[stratum] for stratum in strata])
 
 
 def score_difference(
@@ -346,8 +353,12 @@ def common_results(one: CellReturns, other: CellReturns) -> tuple[CellReturns, C
 
 
 def scored_cells(run: EvaluationRun, cells: Iterable[ResultCell], scales: CellScales) -> list[ResultCell]:
-    """Return the result cells with headroom in which a run played all tasks, in episodes of full length."""
-    return [cell for cell in cells if run.has_full_length(cell) and is_scored(run.returns[cell], scales.get(cell))]
+    """Return the result cells with headroom in which a run played all tasks, in episodes of full length.
+
+    Results of the control `swapped` have no scored cells, because another teammate plays most episodes.
+    """
+    played = [cell for cell in cells if run.has_full_length(cell) and not run.source(cell).detail(CONTROLS["swapped"])]
+    return [cell for cell in played if is_scored(run.returns[cell], scales.get(cell))]
 
 
 def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str]:
@@ -449,7 +460,7 @@ def find_headlines(run: EvaluationRun) -> list[Headline]:
                 protocol=run.protocol,
                 tasks=f"{counted} with headroom, of {len(played)} played" if scored else counted,
                 score=find_score(run.returns, scored, scales),
-                mean=mean_interval(*(of.mean for of in returns)),
+                mean=mean_return(returns),
                 blocks=block_returns_text(returns) if min(run.cells[cell].shape[1] for cell in cells) > 1 else "",
                 why_no_score="" if scored else _missing_score_reason(run, played, scales),
                 overlaps=overlaps,

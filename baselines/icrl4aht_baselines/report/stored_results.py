@@ -60,7 +60,7 @@ class StoredResults:
         return {agent: returns_by_cell(found[agent]) for agent in [*self.agents] if agent in found}
 
     def with_other_play_modes(self, results: Mapping[str, AgentReturns]) -> dict[str, AgentReturns]:
-        """Return `results` so that an agent's other way to act, such as "rl2 (greedy)", follows the agent."""
+        """Return `results` with each agent's other way to act, such as "rl2 (greedy)", after the agent."""
         others, found = {way: self.returns(way) for way in OTHER_WAYS}, {}
         for agent, own in results.items():
             found[agent] = own
@@ -102,8 +102,7 @@ def write_stored(path: Path, stored: StoredResults) -> None:
             text = frame.round(digits).to_csv(index=False, lineterminator="\n")
             # LZMA's output has half the size of gzip's.
             partial.write_bytes(lzma.compress(text.encode(), preset=lzma.PRESET_EXTREME | 9))
-    with atomic_write(path) as partial:
-        write_json(partial, msgspec.to_builtins(stored.agents))
+    write_json(path, msgspec.to_builtins(stored.agents))
 
 
 def _check_update(stored: StoredResults, found: Submission, where: str) -> None:

@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import AGENTS, OTHER_WAYS
-from icrl4aht_baselines.evaluate.protocols import CONTROLS, get_protocol, plan_tasks
+from icrl4aht_baselines.evaluate.protocols import CONTROLS, SUBMITTED_SEEDS, get_protocol, plan_tasks
 from icrl4aht_baselines.evaluate.results import RESULTS
 from icrl4aht_baselines.report.results import bundled_tasks_by_id, find_training_record, read_results
 from icrl4aht_baselines.training.seen import TRAINED_ON
@@ -31,9 +31,6 @@ from icrl4aht_data.utils.text import counted_noun
 
 SUBMITTED_PROTOCOL = "seeded"
 """Name of the protocol that submitted results must have."""
-
-SUBMITTED_SEEDS = (0, 1, 2)
-"""Seeds that every task must be played with."""
 
 _LARGEST = 2.0 * DELIVERY_REWARD * KEPT_STEPS
 """Limit of an episode's absolute return: two agents deliver in every step."""

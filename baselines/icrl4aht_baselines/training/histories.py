@@ -237,6 +237,8 @@ def _sampler(
         raise OptionError(
             f"queries = {histories.queries}: {method.name} learns from windows without queries; leave out --queries"
         )
+    if histories.order != "contiguous":
+        raise OptionError(f"order = {histories.order}: {method.name} learns from windows in order; leave out --order")
     if options.context > steps:
         raise OptionError(
             f"context = {options.context}: the shortest history of {dataset!r} has {steps} steps for a window, with "
@@ -363,7 +365,7 @@ def read_trained(folder: Path) -> TrainedModel:
         expected = observation_shape(layouts[0], channels == "canonical")
         world = overcooked_world(layouts, model.encoder, canonical=channels == "canonical")
         method = get_method(config["method"])(model, world)
-        context, cells = train["context"], config["trained_on"]
+        context, cells = train["context"], config[TRAINED_ON]
     except (KeyError, TypeError) as error:
         raise OptionError(
             f"{folder}: its config.json does not describe a run on learning histories: {error!r}"

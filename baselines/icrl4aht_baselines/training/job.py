@@ -11,7 +11,7 @@ from icrl4aht_generation.learners.resume import TIMING, differing_settings, last
 
 from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_baselines.training.trainer import StepProgress
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import read_json, write_json
 
 
 class TrainingJob(ABC):
@@ -85,7 +85,7 @@ class TrainingJob(ABC):
 
     def result(self) -> dict[str, Any]:
         """Return the content of result.json: `settings`, and the values that `measure` returned."""
-        return parse_json(read_text(self.result_file))
+        return read_json(self.result_file)
 
     def progress(self) -> tuple[int, float] | None:
         """Return the finished training steps and the speed in environment or history steps/s; None if unknown."""
@@ -118,5 +118,4 @@ class TrainingJob(ABC):
                 return
             content = {"settings": self.settings, **self.measure(on_update)}
             self.folder.mkdir(parents=True, exist_ok=True)  # a job that trains nothing has no folder yet
-            with atomic_write(self.result_file) as partial:
-                write_json(partial, content)
+            write_json(self.result_file, content)

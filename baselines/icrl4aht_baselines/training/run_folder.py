@@ -16,7 +16,7 @@ from icrl4aht_baselines.training.loggers import LOGGER_NAMES
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, write_layouts_file
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import atomic_write, check_folder_content, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import check_folder_content, read_json, write_json
 
 RUN_FORMAT = 4
 """Version of the format of run folders. Version 2 has checkpoints as safetensors files, version 3 adds `trained_on` to
@@ -39,7 +39,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONFIG
     try:
-        config = parse_json(read_text(path))
+        config = read_json(path)
         found = config["run_format"]
     except (IndexFormatError, KeyError, TypeError) as error:
         raise OptionError(f"{folder}: not a run: expected {CONFIG} with run_format ({error})") from error
@@ -90,6 +90,5 @@ def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
     if jax.process_index() == 0:
         names = config.get("histories", {}).get("layouts", ())
         write_layouts_file(folder / LAYOUTS_NAME, map(get_layout, names))  # evaluation then needs no release
-        with atomic_write(folder / CONFIG) as partial:
-            write_json(partial, config)
+        write_json(folder / CONFIG, config)
     return config

@@ -289,7 +289,7 @@ class TrainingTask(NamedTuple):
                     lines.append({"step": step, "part": "train", **_as_floats(numbers)})
                     loss = lines[0]["loss"]
                 done(step, loss)
-                if step % options.validate_every == 0 or last:
+                if self.data.validation and (step % options.validate_every == 0 or last):
                     lines += trainer.validation_lines(state, self.data.validation, step)
                 if lines:
                     waited = getattr(batches, "waited", 0.0)  # methods that learn by playing have no loader

@@ -15,7 +15,7 @@ from icrl4aht_generation.learners.resume import run_lock
 from icrl4aht_generation.profiles import Profile, WorkUnit
 
 _GENERATORS = {"ppo": train_and_record, "noise": play_histories, "search": play_histories}
-"""Function of each source that generates an artefact in its partial folder, or resumes there."""
+"""Source -> function that generates an artefact in its partial folder; only that of `ppo` resumes there."""
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ _LINE_BYTES = 100  # maximum size of a line in the files of metrics or timing
 
 
 def _array_shapes(layout: Layout, config: NoiseConfig) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Return the shape and dtype, by name, of each array in a task folder with histories that a script plays."""
+    """Return name -> shape and dtype of each array in an artefact of a scripted source."""
     actions, chances = SCRIPT_ARRAYS
     return array_shapes(layout, config.histories, config.episodes) | {
         actions: ((config.histories, config.episodes * KEPT_STEPS), "int8"),
@@ -54,7 +54,7 @@ def _array_shapes(layout: Layout, config: NoiseConfig) -> dict[str, tuple[tuple[
 
 
 def scripted_bytes(layout: Layout, config: NoiseConfig) -> int:
-    """Return the maximum size in bytes of a task folder with histories that a script plays."""
+    """Return the maximum size in bytes of an artefact of a scripted source."""
     return arrays_bytes(_array_shapes(layout, config)) + (config.histories + config.episodes) * _LINE_BYTES
 
 

@@ -105,8 +105,8 @@ def play_scripted_histories(
         schedules: float32 (N, E), the chance of a random action in every episode.
 
     Yields:
-        Each batch with the arrays of its M episodes of 100 steps: those of `task_folder.HISTORY_ARRAYS` and
-        `script_actions`, int8 (M, 100), the script's actions. The first axis is M instead of (N, E).
+        Each batch of M episodes with its `task_folder.HISTORY_ARRAYS`, with axes (M, 100) instead of (N, T) and M
+        instead of (N, E), and `script_actions`, int8 (M, 100), the script's actions.
     """
     padded = padded_layout(layout, by_size=True) if teammate.sees == "situation" else unpadded_layout(layout)
     tables, expert, own = padded

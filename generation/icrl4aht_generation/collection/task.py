@@ -36,7 +36,7 @@ TEAMMATE_NOISE: Noise = "seeded"
 """Noise of heuristic teammates in training histories: a new key in every episode."""
 
 TASK_SAVE_SECONDS = 30.0
-"""Seconds between two saves; a killed task loses at most the work of this time."""
+"""Minimum number of seconds between two saves; a killed task resumes from the last save."""
 
 
 def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Learner:

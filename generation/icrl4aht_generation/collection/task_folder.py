@@ -3,7 +3,7 @@
 <task_id>/            finished artefact: all hashes match; the name of a second learner's artefact ends in -l1
   metadata.json       task, settings, versions, SHA-256 of the files below
   state.npy actions.npy teammate_actions.npy rewards.npy episode_end_state.npy
-  metrics.jsonl       one line per update
+  metrics.jsonl       one line per update, or per history of a script
   checkpoints/c<k>/   policy.safetensors policy.json, the ego after evenly spaced updates; the last is the final ego
   timing.jsonl        seconds and steps per second, not hashed
   labeller_returns.json   added by packing, not hashed
@@ -35,16 +35,7 @@ from icrl4aht_data.format.cached_arrays import new_mapped_array
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
-from icrl4aht_data.utils.files import (
-    NO_ROOM,
-    atomic_write,
-    file_hash,
-    hashes_match,
-    json_hash,
-    parse_json,
-    read_text,
-    write_json,
-)
+from icrl4aht_data.utils.files import NO_ROOM, atomic_write, file_hash, hashes_match, json_hash, read_json, write_json
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic
@@ -63,7 +54,7 @@ HISTORY_ARRAYS = ("state", "actions", "teammate_actions", "rewards", "episode_en
 """Arrays of N histories with E episodes and T = 100 E steps, in every artefact:
 
     state               uint8 (N, T, S), state records before each step
-    actions             int8 (N, T), the ego's sampled actions
+    actions             int8 (N, T), the ego's actions
     teammate_actions    int8 (N, T), the teammate's actions
     rewards             int8 (N, T), the team's rewards without shaping
     episode_end_state   uint8 (N, E, S), state records after the last stored step of each episode
@@ -159,7 +150,7 @@ def is_task_finished(folder: Path, work: WorkUnit, profile: Profile) -> bool:
     """Return whether a folder contains the complete artefact of a unit of work, with the profile's settings."""
     settings = artefact_settings(work, profile)
     try:
-        metadata = parse_json(read_text(folder / METADATA))
+        metadata = read_json(folder / METADATA)
         same = {name: metadata[name] for name in settings} == settings
         listed = sorted(metadata["files"]) == hashed_files(work, profile)
         return same and listed and hashes_match(folder, metadata["files"])
@@ -281,7 +272,6 @@ class ArrayWriter:
             "seconds": round(seconds, 6),
             "recording": round(self._recording, 6),
         }
-        # The first batch includes compilation, so measure the speed from the second batch on.
         if not self._has_written:
             self._started, self._steps, self._recording, self._has_written = now, 0, 0.0, True
         return timing

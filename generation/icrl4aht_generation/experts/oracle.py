@@ -32,7 +32,8 @@ from icrl4aht_generation.policy import Policy, Situation, on_layout
 WAIT_LIMIT = 10
 """Steps without a change in the pots after which the ego stops waiting for the teammate."""
 
-_DISH = np.uint8(PLATE | COOKED)
+DISH = np.uint8(PLATE | COOKED)
+"""Bits that all dishes on a plate have."""
 
 
 class OracleMemory(NamedTuple):
@@ -162,7 +163,7 @@ class OracleView:
     @cached_property
     def dish(self) -> UInt8[Array, ""]:
         """Item byte of the current recipe's soup on a plate."""
-        return self.recipes[0] | _DISH
+        return self.recipes[0] | DISH
 
     def cost(self, mask: Bool[Array, " cells"] | np.ndarray, then: Array | int = 0) -> Int[Array, " cells"]:
         """Return the steps until the ego faces each reachable cell in `mask`, plus `then`; NEVER for other cells."""
@@ -270,7 +271,7 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
     full = facts.pots & (ingredient_count(contents) == 3)
     recipes = jnp.concatenate([state.recipe[None], jnp.asarray(facts.recipes)])
     cooked = (full[:, None] & (contents[:, None] == recipes)).sum(axis=0)
-    plated = ((items[:, None] == recipes | _DISH) & mine[:, None]).sum(axis=0) + (scene.hand == recipes | _DISH)
+    plated = ((items[:, None] == recipes | DISH) & mine[:, None]).sum(axis=0) + (scene.hand == recipes | DISH)
     # Assume that a teammate which has never held a plate takes no soups.
     risky = memory.plates & facts.mate_serves
     return OracleView(
@@ -286,11 +287,11 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
         full=full,
         right=full & (contents == state.recipe),
         recipes=recipes,
-        stock=cooked + plated + ((scene.partner_hand == recipes | _DISH) & ~memory.parks),
+        stock=cooked + plated + ((scene.partner_hand == recipes | DISH) & ~memory.parks),
         missing=scene.ingredient_counts(recipes) - scene.ingredient_counts(contents)[:, None],
         risky=risky,
         careful=risky & memory.cooks,
-        mate_delivers=(scene.partner_hand == state.recipe | _DISH) & ~memory.parks,
+        mate_delivers=(scene.partner_hand == state.recipe | DISH) & ~memory.parks,
     )
 
 

@@ -27,11 +27,10 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.cells import COOKED, GOAL, PLATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import State, columns, ingredient_count, possible_recipes, unpack
-from icrl4aht_generation.experts.oracle import SITUATION_ORACLE, OracleMemory, oracle_params
-from icrl4aht_generation.paths import Scene
+from icrl4aht_generation.experts.oracle import DISH, SITUATION_ORACLE, OracleMemory, oracle_params
+from icrl4aht_generation.paths import Scene, is_ingredient
 from icrl4aht_generation.policy import Policy, Situation
 
-_FLAGS = np.uint8(PLATE | COOKED)
 _NO_DISH = 0
 
 MOST_DISHES = 10
@@ -123,14 +122,14 @@ def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, "
     at_goal = jnp.asarray(view.tables.kinds)[ahead.astype(jnp.int32)] == GOAL
     same_pose = (new.positions == old.positions) & (new.facings == old.facings)
     gave = (old.hands & COOKED > 0) & (new.hands == 0) & at_goal & same_pose & follows
-    is_dish = (old.hands[:, None] == dishes | _FLAGS) & gave[:, None]  # shape (2, D)
+    is_dish = (old.hands[:, None] == dishes | DISH) & gave[:, None]  # shape (2, D)
     # If both agents deliver in one step, the reward does not show whose dish was right.
     paid = memory.paid | (is_dish.any(axis=0) & (new.delivered > 0) & ~gave.all())
     refused = memory.refused | (is_dish[EGO] & (new.delivered == 0))
     # The ingredients that the teammate cooks hint at the wanted dish, although the teammate may make mistakes.
     had = old.hands[TEAMMATE]
     into_pot = jnp.sum(ingredient_count(new.pot_items)) > jnp.sum(ingredient_count(old.pot_items))
-    put = (had >> 2 > 0) & (had & PLATE == 0) & (new.hands[TEAMMATE] == 0) & into_pot
+    put = is_ingredient(had) & (new.hands[TEAMMATE] == 0) & into_pot
     seen = memory.seen + jnp.where(put, Scene.ingredient_counts(had), 0)
     fits = (Scene.ingredient_counts(dishes) @ seen) / jnp.maximum(seen.sum(), 1)
     score = jnp.where(paid, 100.0, fits + 0.1 * memory.order) - 1000.0 * (refused | (dishes == _NO_DISH))

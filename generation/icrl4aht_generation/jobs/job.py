@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.utils.files import NO_ROOM, atomic_write, process_lock, read_text
+from icrl4aht_data.utils.files import NO_ROOM, atomic_write, lock_file_path, process_lock, read_text
 from icrl4aht_generation.jobs.options import request_determinism
 from icrl4aht_generation.learners.resume import BusyError, limit_xla_threads
 
@@ -125,7 +125,7 @@ def update_failures(path: Path, lines: dict[str, Any]) -> bool:
         Whether the log is up to date; False if the disk is full and the log is unchanged.
     """
     try:
-        with process_lock(path.with_name(f".{path.name}.lock")):
+        with process_lock(lock_file_path(path)):
             found = [json.loads(line) for line in read_text(path).splitlines()] if path.exists() else []
             before = {line["task_id"]: line for line in found}
             after = {name: line for name, line in (before | lines).items() if line}

@@ -77,7 +77,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
                 continue
             if outcome.status == "done":
                 console.print(f"{labels[name]}: {outcome.job.finished_text()}")
-                missing.remove(name)
+                missing.discard(name)
                 lines[name] = None
             else:
                 last_error, attempts = outcome.error, outcome.attempts

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Callable, Iterator
 from itertools import islice
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
 from icrl4aht_data.errors import OptionError, check_choice, unknown_name
+from icrl4aht_data.format.layouts_file import is_generated
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_generation.layouts.fixtures import LayoutDraw
@@ -76,13 +76,12 @@ def find_generated(name: str) -> Layout:
         OptionError: if the name is not family-seed-number, or the family has no layout of this number.
         UnknownNameError: if the family does not exist.
     """
-    parts = re.fullmatch(r"(\w+)-(\d+)-(\d+)", name, re.ASCII)
-    if not parts:
+    if not is_generated(name):
         raise OptionError(
             f"{name}: expected the name of a generated layout, family-seed-number, such as templates-0-17"
         )
-    family, seed, number = parts[1], int(parts[2]), int(parts[3])
-    return generate_layouts(family, seed, number + 1)[number]
+    family, seed, number = name.split("-")
+    return generate_layouts(family, int(seed), int(number) + 1)[int(number)]
 
 
 def _named_layouts(family: str, seed: int) -> Iterator[Layout]:

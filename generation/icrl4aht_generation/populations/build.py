@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +22,10 @@ from icrl4aht_data.benchmark.facts import (
     track_layouts,
 )
 from icrl4aht_data.dataset import load_icrl4aht
-from icrl4aht_data.errors import OptionError, check_choice
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.utils.files import atomic_write, write_json
+from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.text import markdown_table
 from icrl4aht_data.writing.splits import played_teammates, teammates_hash
@@ -60,7 +59,7 @@ def build_suite(
     algorithms: Mapping[str, Sequence[str]],
     seed: int,
     console: Console,
-    options: QueueOptions | None = None,
+    options: QueueOptions,
 ) -> list[TeammateSelection]:
     """Train unfinished populations, then write manifests of tasks with teammates of every finished population.
 
@@ -79,14 +78,12 @@ def build_suite(
 
     Raises:
         FailedJobsError: if a population could not be trained.
-        UnknownNameError: if an algorithm does not exist.
     """
-    for name in chain(*algorithms.values()):
-        check_choice("algorithm", name, ALGORITHMS)
     config = profile.teammates
     runs = population_runs(profile, algorithms, seed)
-    jobs = [PopulationJob(run, suite, profile.xla_threads) for run in runs]
-    run_jobs(jobs, suite, console, options or QueueOptions())
+    # The path is absolute, as workers have other working directories.
+    jobs = [PopulationJob(run, suite.resolve(), profile.xla_threads) for run in runs]
+    run_jobs(jobs, suite, console, options)
     wanted = [(run.layout.name, run.algorithm) for run in runs]
     selections = [
         select_teammates(suite, name, algorithm, config.train, config.heldout, seed)
@@ -133,7 +130,7 @@ def report_diversity(
 
     Args:
         suite: the suite's folder.
-        layouts: names of layouts; by default all layouts with a finished population of every algorithm.
+        layouts: names of layouts; by default all layouts with a finished population of each of `algorithms`.
         algorithms: algorithms of the populations.
         greedy: whether teammates take their most probable actions.
         console: where to print.
@@ -142,7 +139,7 @@ def report_diversity(
         OptionError: if a population is not finished, or no layout has all populations.
     """
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or [
-        name for name in training_layouts() if all(is_trained(suite, name, algorithm) for algorithm in ALGORITHMS)
+        name for name in training_layouts() if all(is_trained(suite, name, algorithm) for algorithm in algorithms)
     ]
     if not names:
         raise OptionError(
@@ -178,8 +175,7 @@ def report_splits(root: Path, stored: Path | None, console: Console) -> None:
     if stored:
         played = played_teammates(dataset.tasks.values(), dataset.provenance)
         content = {"teammates": teammates_hash(played), "layouts": msgspec.to_builtins(found)}
-        with atomic_write(stored) as partial:
-            write_json(partial, content)
+        write_json(stored, content)
 
 
 def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, console: Console) -> None:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS, layout_number, layout_track
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
-from icrl4aht_data.utils.files import atomic_write, file_hash, lock_file_path, process_lock
+from icrl4aht_data.utils.files import file_hash, lock_file_path, process_lock
 from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS
 from icrl4aht_generation.populations.train import SuiteCheckpoint, suite_checkpoints
 
@@ -111,7 +111,6 @@ def write_manifests(suite: Path, selections: Sequence[TeammateSelection]) -> lis
                 if not tasks:
                     path.unlink(missing_ok=True)
                     continue
-                with atomic_write(path) as partial:
-                    write_tasks(partial, tasks)
+                write_tasks(path, tasks)
                 written.append(path)
     return written

@@ -26,15 +26,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import ALGORITHMS
 from icrl4aht_data.errors import IndexFormatError, OptionError, check_choice
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.files import (
-    atomic_write,
-    file_hash,
-    hashes_match,
-    json_hash,
-    parse_json,
-    read_text,
-    write_json,
-)
+from icrl4aht_data.utils.files import file_hash, hashes_match, json_hash, read_json, write_json
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.checkpoint import (
@@ -156,7 +148,7 @@ class PopulationRun:
 def read_record(folder: Path) -> dict[str, Any]:
     """Return the record of a finished population; an empty record if the file is missing or invalid."""
     try:
-        record = parse_json(read_text(folder / POPULATION))
+        record = read_json(folder / POPULATION)
     except IndexFormatError:
         return {}
     return record if isinstance(record, dict) else {}
@@ -378,8 +370,7 @@ class _PopulationTraining:
             "software": software_versions(),
             "files": files,
         }
-        with atomic_write(self.folder / POPULATION) as partial:
-            write_json(partial, content)
+        write_json(self.folder / POPULATION, content)
         (self.folder / _RESUME).unlink(missing_ok=True)
 
 

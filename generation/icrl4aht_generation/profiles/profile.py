@@ -27,15 +27,12 @@ from icrl4aht_generation.layouts.families import split_of
 from icrl4aht_generation.learners.checkpoint import POLICY_CHECKPOINTS
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
-from icrl4aht_generation.teammates.draws import drawn_teammates
+from icrl4aht_generation.teammates.draws import VALIDATION_SEED, drawn_teammates
 from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_teammate
 from icrl4aht_generation.teammates.spread import spread_teammates
 
 LEAST_EPISODES = 5
 """Minimum number of episodes of a history, because its initial and final returns are means over five episodes."""
-
-VALIDATION_DRAWS = 1
-"""Base seed of sampled validation teammates; training teammates have base seed 0, so the splits share no teammate."""
 
 _SOURCE_SEEDS, _LAYOUT_SEEDS, _FAMILY_SEEDS, _DRAW_SEEDS = 1_000_000, 10_000, 1_000, 500
 _SPREAD_SEEDS = 250_000
@@ -138,7 +135,7 @@ class SampledConfig(SpreadConfig):
     families: dict[str, tuple[str, ...]]
 
     def _split_entries(self, layout: str, split: str, count: int) -> list[dict[str, Any]]:
-        seed = VALIDATION_DRAWS if split == "validation" else 0
+        seed = VALIDATION_SEED if split == "validation" else 0
         return [entry for entry, _ in drawn_teammates(layout, self.families[layout], count, seed)]
 
 

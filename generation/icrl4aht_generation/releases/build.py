@@ -14,7 +14,7 @@ from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.plotting import check_can_draw
-from icrl4aht_data.utils.files import check_folder_content, process_lock
+from icrl4aht_data.utils.files import check_folder_content, lock_file_path, process_lock
 from icrl4aht_data.utils.progress import bar_updater, progress_bars
 from icrl4aht_data.writing.card import card_facts, print_learning_curves, teammate_name
 from icrl4aht_generation.collection.job import CollectionJob
@@ -29,8 +29,6 @@ from icrl4aht_generation.releases.package import check_release_folder, package_r
 
 SUITE = "suite"
 """Name of the suite's folder in the output folder of `generate`."""
-
-_PACKING_LOCK = ".packing.lock"
 
 
 def build_releases(
@@ -71,18 +69,19 @@ def build_releases(
         check_release_folder(out / kind, profile)
     options = options or QueueOptions()
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # absolute, as workers have other working directories
-    names = {"artefacts", SUITE, FAILED, f".{FAILED}.lock", _PACKING_LOCK, *KINDS, *(f".{kind}.old" for kind in KINDS)}
+    names = {"artefacts", "packing", SUITE, FAILED, *KINDS, *(f".{kind}.old" for kind in KINDS)}
     check_folder_content(out, names | ({suite.name} if suite.parent == out else set()), "a rebuild")
     if tasks is None:
         units, headroom, left_out = train_teammates(profile, suite, seed, console, options)
     else:
         units, headroom, left_out = profile.units_of(tasks, sources or {}), {}, []
-    generated = tuple(get_layout(name) for name in profile.layouts if name not in LAYOUTS)
+    names = dict.fromkeys([*profile.layouts, *(work.task.layout.name for work in units)])
+    generated = tuple(get_layout(name) for name in names if name not in LAYOUTS)
     jobs = [CollectionJob(work, profile, out / "artefacts", suite, generated) for work in units]
     run_jobs(jobs, out, console, options)
     tasks = list({work.task.task_id: work.task for work in units}.values())
     artefacts, releases = out / "artefacts", [out / kind for kind in kinds]
-    with process_lock(out / _PACKING_LOCK):  # other processes may pack the same releases
+    with process_lock(lock_file_path(out / "packing")):  # other processes may pack the same releases
         facts = teammate_facts(tasks, artefacts, suite, headroom)
         for kind, release in zip(kinds, releases, strict=True):
             with progress_bars(unit="tasks") as show:

@@ -8,7 +8,6 @@ best labeller labels the histories of all learners.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -25,7 +24,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.provenance import ExpertLabels
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.files import read_text
+from icrl4aht_data.utils.files import read_text, short_hash
 from icrl4aht_generation.collection.task import TEAMMATE_NOISE
 from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA, checkpoint_path
 from icrl4aht_generation.env import Environment
@@ -128,7 +127,7 @@ def choose_checkpoint(returns: np.ndarray) -> int:
 
 def _measure(checkpoints: list[Path], task: Task, suite: Path) -> CheckpointReturns:
     teammate = build_teammate(task.layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
-    key = jax.random.key(int(hashlib.sha256(task.task_id.encode()).hexdigest()[:8], 16))
+    key = jax.random.key(int(short_hash(task.task_id.encode(), 8), 16))
     measured = CheckpointReturns([], [])
     for path in checkpoints:
         network, params, _ = load_policy(path)

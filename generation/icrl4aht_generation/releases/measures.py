@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache, partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -136,7 +135,6 @@ def teammate_facts(
         chosen = [next((task for task in groups[key] if task.task_id in headroom), groups[key][0]) for key in keys]
         kept = artefacts / f".{layout}.teammates.json"
         settings = software_versions() | {
-            "version": version("icrl4aht-data"),
             "layout": layout,
             "teammates": [[task.teammate, task.recipes] for task in chosen],
             "episodes": REFERENCE_EPISODES,

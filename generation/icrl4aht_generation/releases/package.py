@@ -118,7 +118,7 @@ def select_histories(
             f"no headroom: returns of these egos differ by less than {LEAST_HEADROOM:g}: {facts.references.describe()}"
         )
     if not len(found.kept_returns):
-        return found.left_out(f"the learners did not learn: no stream's end exceeds its start by {least or 0:g}")
+        return found.left_out(f"the learners did not learn: no stream's return rises by {least or 0:g}")
     start, end = curve_ends(found.kept_returns)
     if headroom and profile.least_rise is not None and end.mean() - start.mean() < profile.least_rise:
         return found.left_out(

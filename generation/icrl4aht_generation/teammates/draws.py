@@ -37,9 +37,11 @@ ranges for training and validation, 2 and 3 are diverse draws for training and v
 
 _OF_SEED = {0: "drawn training", 1: "drawn validation", 2: "diverse training", 3: "diverse validation"}
 
-_VALIDATION_SEED, _VALIDATION_TEAMMATES = 1, 4
+VALIDATION_SEED, _VALIDATION_TEAMMATES = 1, 4
+"""Base seed of drawn validation teammates; training teammates have base seed 0, so the splits share no teammate."""
 
-_DIVERSE_SEEDS = {"train": 2, "validation": 3}
+DIVERSE_SEEDS = {"train": 2, "validation": 3}
+"""Base seed of diverse teammates by split."""
 
 _DIVERSE_TEAMMATES = {"train": 12, "validation": 3}  # maximum number of tasks of a family on a layout
 
@@ -49,11 +51,11 @@ DIVERSE_DISTANCE = 0.1
 
 def ranges_of(base_seed: int) -> str:
     """Return the name of the parameter ranges for a base seed: "train" or "diverse", see `sample_teammate`."""
-    return "diverse" if base_seed in _DIVERSE_SEEDS.values() else "train"
+    return "diverse" if base_seed in DIVERSE_SEEDS.values() else "train"
 
 
 def _least_distance(base_seed: int) -> float:
-    return DIVERSE_DISTANCE if base_seed in _DIVERSE_SEEDS.values() else SAME_BEHAVIOUR
+    return DIVERSE_DISTANCE if base_seed in DIVERSE_SEEDS.values() else SAME_BEHAVIOUR
 
 
 class Draw(Struct, frozen=True, forbid_unknown_fields=True):
@@ -105,7 +107,7 @@ class Draw(Struct, frozen=True, forbid_unknown_fields=True):
         The draw is `admissible` if this distance is large enough.
         """
         own, other = (self.distance, self.nearest), (self.other_distance, self.other)
-        diverse = self.base_seed in _DIVERSE_SEEDS.values()
+        diverse = self.base_seed in DIVERSE_SEEDS.values()
         return other if diverse and other[0] < own[0] else own
 
     @property
@@ -182,9 +184,9 @@ def validation_tasks(track: str) -> list[Task]:
     """
     tasks = []
     for layout in (layout for layout in TRACKS[track]["validation"] if layout in TESTED_ON):
-        families = usable_families(layout, _VALIDATION_SEED)
-        count = min(_VALIDATION_TEAMMATES, sum(len(_usable(layout, family, _VALIDATION_SEED)) for family in families))
-        chosen = drawn_teammates(layout, families, count, _VALIDATION_SEED)
+        families = usable_families(layout, VALIDATION_SEED)
+        count = min(_VALIDATION_TEAMMATES, sum(len(_usable(layout, family, VALIDATION_SEED)) for family in families))
+        chosen = drawn_teammates(layout, families, count, VALIDATION_SEED)
         tasks += [make_task(track, "validation", layout, teammate, seed=0) for teammate, _ in chosen]
     return tasks
 
@@ -198,7 +200,7 @@ def diverse_tasks(track: str, split: str) -> list[Task]:
         track: name of the track.
         split: "train" or "validation".
     """
-    seed, most = _DIVERSE_SEEDS[split], _DIVERSE_TEAMMATES[split]
+    seed, most = DIVERSE_SEEDS[split], _DIVERSE_TEAMMATES[split]
     tasks = []
     for layout in (layout for layout in TRACKS[track]["train"] if layout in TESTED_ON):
         for family in usable_families(layout, seed):
@@ -270,7 +272,7 @@ def unusable_reason(layout: str, family: str, base_seed: int = 0) -> str:
     admissible = [draw for draw in draws if draw.admissible]
     if not admissible:
         farthest = max(draw.nearest_test_instance[0] for draw in draws)
-        tests = "a test teammate" if base_seed in _DIVERSE_SEEDS.values() else "a test teammate of the family"
+        tests = "a test teammate" if base_seed in DIVERSE_SEEDS.values() else "a test teammate of the family"
         return f"all {len(draws)} draws act like {tests} (distance {farthest:.3f} at most)"
     widest = max(draw.spread for draw in admissible)
     return (

@@ -19,6 +19,7 @@ from typing import Any
 from icrl4aht_data.benchmark.facts import PLAIN, PREFERENCE, PREFERENCE_LAYOUTS
 from icrl4aht_data.benchmark.tasks import Dish, Task, make_task
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_generation.teammates.draws import DIVERSE_SEEDS
 from icrl4aht_generation.teammates.heuristics.territory import LAZY, TERRITORY
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_teammates
 from icrl4aht_generation.teammates.registry import heuristic_entry, sample_teammate
@@ -27,9 +28,6 @@ WATCHER = heuristic_entry(
     TERRITORY.kind, INSTANCES, 0, TERRITORY.defaults | {"behavior_mode": LAZY, "action_probability": 0.0}
 )
 """Entry of a teammate that never acts."""
-
-_DRAWS = {"train": 2, "validation": 3}
-"""Seed of the sampled diverse teammates by split, as in `teammates.draws`."""
 
 _TEST_TASKS = {"train": 5, "test": 10}
 """Number of test tasks on each layout, for layouts of training and other layouts."""
@@ -79,6 +77,6 @@ def _teammates(layout: Layout, split: str) -> list[dict[str, Any]]:
             if split == "test":
                 found.append(published_teammates(layout.name.removesuffix(PLAIN), family)[instance])
             else:
-                found.append(sample_teammate(family, instance, "diverse", _DRAWS[split]))
+                found.append(sample_teammate(family, instance, "diverse", DIVERSE_SEEDS[split]))
         found += [] if split == "train" else [WATCHER]
     return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -18,6 +17,7 @@ from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice, unk
 from icrl4aht_data.format.schema import TEAMMATES
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.files import short_hash
 from icrl4aht_generation.policy import Noise, Policy
 from icrl4aht_generation.teammates import learned
 from icrl4aht_generation.teammates.heuristics.assembly_line import ASSEMBLY_LINE
@@ -80,8 +80,7 @@ def _sampled_theta(heuristic: Heuristic, split: str, seed: str) -> dict[str, flo
     check_choice("split", split, samplings)
     presets, ranges = samplings[split]
     # A SHA-256 hash as seed depends neither on the order of calls nor on Python's salted hashes.
-    digest = hashlib.sha256(seed.encode()).hexdigest()
-    key, own = jax.random.split(jax.random.key(int(digest[:8], 16)))
+    key, own = jax.random.split(jax.random.key(int(short_hash(seed.encode(), 8), 16)))
     theta = heuristic.defaults | heuristic.presets[presets[_randint(own, len(presets))]]
     for name, value in theta.items():
         key, own = jax.random.split(key)  # also for fixed parameters, so no draw depends on which others have ranges

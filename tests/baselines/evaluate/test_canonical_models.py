@@ -114,7 +114,7 @@ def test_layout_numbers_of_a_batch_determine_the_layouts_of_observations(lite):
     view = CompactView("paper", tuple(map(get_layout, names)), canonical=True)
     found = {}
     for part, sampler in {"train": job.data.train, **job.data.validation}.items():
-        batch = sampler[0]
+        batch = sampler.batch(0)
         rendered: Any = view(jnp.asarray(batch.obs), jnp.asarray(batch.layouts))
         stored = sampler.dataset.with_options(obs="uint8").ad(batch_size=8, length=6)[0]
         np.testing.assert_array_equal(np.asarray(rendered), stored.obs, strict=True, err_msg=part)

@@ -284,6 +284,12 @@ class TestPreparation:
     def prepare(self, play: PlayOptions, tasks: Any = (), choice: HistoryOptions = CHOICE, batch: int = 64) -> Any:
         return prepare_play("rl2", self.MODEL, TrainOptions(steps=1, batch_size=batch), play, choice, tasks)
 
+    def test_options_for_histories_are_refused(self):
+        for change in ({"first": 3}, {"every": 2}, {"labels": "expert"}):
+            (name,) = change
+            with pytest.raises(OptionError, match=f"{name} = .*: rl2 learns by playing, not from histories"):
+                self.prepare(PlayOptions(), choice=dataclasses.replace(self.CHOICE, **change))
+
     def test_teammates_of_manifest_tasks_are_added_and_recorded(self):
         tasks = read_tasks(manifest_path("layout", "train", "diverse"))
         plain, job = (self.prepare(PlayOptions(), of, batch=128) for of in ((), tasks))

@@ -7,8 +7,9 @@ from io import StringIO
 import numpy as np
 import pandas as pd
 import pytest
-from icrl4aht_baselines.evaluate.protocols import bundled_tasks
-from icrl4aht_baselines.report import page, scores
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, bundled_tasks
+from icrl4aht_baselines.evaluate.results import Result
+from icrl4aht_baselines.report import page, report, scores
 from icrl4aht_baselines.report.results import BLOCKS, CellReturns, ResultCell, task_label
 from icrl4aht_baselines.report.scores import CellScale, TaskScale
 from msgspec import structs
@@ -163,6 +164,34 @@ def test_results_without_a_score_have_a_reason(invented_responses):
     assert flat.why_no_score == "No score: no best response earns 5 more than `stay` in these cells."
     (published,) = scores.find_headlines(evaluated_run("mine", protocol="published"))
     assert published.why_no_score == "No score: best responses were measured under protocol seeded."
+
+
+def test_results_of_the_control_swapped_have_no_score(invented_responses):
+    """Another teammate plays all but the last episodes, so only the last block has reference returns."""
+    run = evaluated_run("mine (swapped)", details={"swapped": True})
+    assert {*run.table["control"]} == {"swapped"}
+    (found,) = scores.find_headlines(run)
+    assert found.score is None
+    rows = scores.add_scales(run.table)
+    assert {*rows[rows["best"].notna()]["block"]} == {"last 20"}
+    (cleared,) = scores.find_headlines(evaluated_run("mine (cleared)", details={"forget": True}))
+    assert cleared.score is not None
+
+
+def test_behaviours_are_the_units_of_the_interval_of_a_mean_return():
+    """The five teammates of family H4 act alike, so seeds are resampled, of which there is one."""
+    same, different = (evaluated_run("mine", families=(family,)).returns for family in ("H4", "H1"))
+    assert np.isnan(scores.mean_return(same.values()).low)
+    assert scores.mean_return(different.values())[:3] == pytest.approx((11.0, 11.0, 11.0))
+
+
+def test_report_keeps_the_rows_of_three_results_of_one_agent():
+    tasks = [task for task in TEST_TASKS if task.layout.name == "demo_wide" and task.teammate_family == "H1"]
+    settings = {"agent": "mine", "seeds": [0], "protocol": PROTOCOLS["seeded"].settings, "code_version": "0"}
+    found = [[Result(task.task_id, settings, [[value] * 100]) for task in tasks] for value in (1.0, 2.0, 3.0)]
+    text = report(*found)
+    for label, value in (("mine", 1.0), ("mine [results 2]", 2.0), ("mine [results 3]", 3.0)):
+        assert f"| H1 | {label} | {value} " in text
 
 
 def test_results_with_other_episode_lengths_show_no_paper_numbers():

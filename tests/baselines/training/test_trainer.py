@@ -370,6 +370,7 @@ class TestHeldOut:
             ("ad", 61, {"first": 3}, "context = 61: .* has 60 steps .* every = 1 and first = 3;"),
             ("dpt", 7, {"every": 2}, "every = 2: dpt learns from contexts, but only windows can skip episodes"),
             ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
+            ("ad", 7, {"order": "random"}, "order = random: ad learns from windows in order"),
         ],
     )
     def test_training_options_that_do_not_fit_the_data_raise_errors(

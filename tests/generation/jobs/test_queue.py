@@ -100,6 +100,11 @@ def test_jobs_in_local_processes_are_retried_and_reported(tmp_path):
     assert (tmp_path / "bad").read_text() == str(os.getpid())
 
 
+def test_jobs_of_the_same_name_count_as_one(tmp_path):
+    printed = run([FileJob(tmp_path, "same"), FileJob(tmp_path, "same")], tmp_path)
+    assert printed.count("same") == 2 and "unfinished" not in printed
+
+
 def test_quick_jobs_share_worker_processes(tmp_path):
     """Quick jobs share at most two worker processes, and every other job gets a new process."""
     jobs = [FileJob(tmp_path, f"{number}") for number in range(5)]

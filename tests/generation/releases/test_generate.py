@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from icrl4aht_generation.collection import job
 from icrl4aht_generation.collection import task_folder as artefacts
+from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.collection.task_folder import METADATA
 from icrl4aht_generation.jobs.job import FailedJobsError
 from icrl4aht_generation.learners.checkpoint import load_policy
@@ -105,6 +106,24 @@ def test_rebuild_in_folder_with_other_files_raises_error(built, tmp_path):
     with pytest.raises(OptionError, match=r"has other files \(thesis.txt\), expected a rebuild"):
         rebuild(built / "tiny.toml", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_workers_know_the_generated_layouts_of_given_tasks(tmp_path, monkeypatch):
+    queued: list[CollectionJob] = []
+
+    def run_nothing(jobs: list[CollectionJob], *rest: object) -> None:
+        queued.extend(jobs)
+        raise FailedJobsError("no job was run")
+
+    monkeypatch.setattr(build, "run_jobs", run_nothing)
+    bundled = [
+        load_icrl4aht(source="noise", layout="cramped_up"),
+        *(load_icrl4aht(source="noise", layout_family=family) for family in ("templates", "rooms")),
+    ]
+    tasks = [one.tasks[one[0].entry.task_id] for one in bundled]
+    with pytest.raises(FailedJobsError):
+        build.build_releases(load_profile("noise"), tmp_path, ["lite"], Console(file=StringIO()), tasks=tasks)
+    assert [layout.name for layout in queued[0].layouts] == [task.layout.name for task in tasks[1:]]
 
 
 def test_rebuild_does_not_replace_release_of_another_profile(built, tmp_path, monkeypatch):
@@ -228,6 +247,7 @@ def test_repeated_rebuild_runs_no_job_again(learned_rebuild, monkeypatch):
     monkeypatch.setattr(select, "THRESHOLD", -np.inf)
     monkeypatch.setattr(suite._PopulationTraining, "train", fail_if_called)
     monkeypatch.setitem(job._GENERATORS, "ppo", fail_if_called)
+    (learned_rebuild / ".packing.lock").touch()  # as if the build had been killed while it packed the release
     assert rebuild(learned_rebuild.parent / "learned.toml", learned_rebuild).count("finished before") == 4
 
 

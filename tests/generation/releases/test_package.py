@@ -120,8 +120,8 @@ def test_improving_histories_of_both_learners_are_kept(two_learners, profile, tm
         np.testing.assert_array_equal(history.read("oracle_actions"), wanted)
     card = (root / "README.md").read_text()
     assert "2 independent learners a task" in card
-    assert "on demo_wide: of 16 streams of a task the 4 with the highest end + improvement" in card
-    assert "only if the end exceeds the start by 5 or more, divided equally" in card
+    assert "on demo_wide: of 16 streams of a task the 4 with the highest final return + improvement" in card
+    assert "if the return rises by 5 or more, divided equally" in card
     assert "![Learning curves](figures/learning_curves.png)" in card
     assert "figures/learning_curves.png" in read_manifest(root)
     assert (root / "figures/learning_curves.png").stat().st_size < 100_000
@@ -159,7 +159,7 @@ def test_tasks_without_improving_histories_or_headroom_are_left_out(built, two_l
     (left_out,) = read_info(root).left_out
     assert (left_out.task_id, left_out.teammate, left_out.source) == (flat.task_id, "H4/t1", "ppo")
     assert (left_out.learners, left_out.streams, left_out.return_start, left_out.return_end) == (2, 16, 0, 1)
-    assert "no stream's end exceeds its start by 5" in left_out.reason
+    assert "no stream's return rises by 5" in left_out.reason
     assert {entry.task_id for entry in load_icrl4aht(root).entries} == {two_learners[0].task.task_id}
     assert verify_release(root).findings == []
     (left_out,) = read_info(package_tasks(tmp_path, strict, units, facts | {flat.task_id: DOES_NOT})).left_out

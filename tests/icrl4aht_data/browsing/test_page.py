@@ -196,7 +196,6 @@ class TestBrowseCommand:
 
 
 def test_impossible_states_and_actions_raise_errors(release, monkeypatch):
-    history = load_icrl4aht(release)[0]
     read, wrong = History.read, []
 
     def read_damaged_rows(self, name, start=0, stop=None):
@@ -210,6 +209,6 @@ def test_impossible_states_and_actions_raise_errors(release, monkeypatch):
     for name, found in (("state", "a position"), ("expert_actions", "expert_actions below 6"), ("dones", "ends")):
         wrong.append(name)
         with pytest.raises(ReleaseError, match=f"history 0: .*{found}"):
-            embed_history(history)
+            embed_history(load_icrl4aht(release)[0])
         wrong.clear()
-    assert len(embed_history(history).records) == 8 * 21
+    assert len(embed_history(load_icrl4aht(release)[0]).records) == 8 * 21

@@ -166,6 +166,14 @@ def test_deep_verification_finds_observations_that_differ_from_the_state(tmp_pat
     assert found.endswith("obs: 1 steps differ from what their state shows, first step 17")
 
 
+def test_verify_finds_equal_histories_in_different_shards(tmp_path):
+    (task,) = make_tasks(["demo_simple"])
+    arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
+    new = NewTask(task, Provenance(), 2, lambda: [NewHistory(0, arrays), NewHistory(1, arrays)])
+    write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20, shard_histories=1)
+    assert any("history 1: has the content of history 0" in problem for problem in problems(tmp_path / "r"))
+
+
 def test_verify_finds_the_chunk_table_of_another_shard(release_copy):
     random_release(release_copy.with_name("other"), streams=2)
     shutil.copy(release_copy.with_name("other") / chunk_table_name(SHARD), release_copy / chunk_table_name(SHARD))
@@ -195,7 +203,7 @@ def test_verify_finds_a_shard_without_index_lines(tmp_path):
     tamper(tmp_path / "r", INFO, lambda content: content.update(histories=1))
     tamper(tmp_path / "r", HISTORIES, lambda lines: lines.pop())
     found = problems(tmp_path / "r")
-    assert any("00001-of-00002.h5: the name of" in problem for problem in found), found
+    assert sum("00001-of-00002.h5: names of other shards imply" in problem for problem in found) == 1, found
 
 
 def test_verify_finds_episode_lengths_that_differ_from_info(release_copy):

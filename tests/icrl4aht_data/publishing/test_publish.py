@@ -163,7 +163,7 @@ def test_the_card_describes_the_release(published_release):
     patterns = [file["path"] for config in facts["configs"] for file in config["data_files"]]
     assert all(list(published_release.glob(pattern)) for pattern in patterns)
     assert "12 histories of 6 tasks, 1,440 transitions; each history has 120 steps." in card
-    assert re.search(r"\| coord_simple \| train \| \S+ to \S+ \(4\) \|", card)
+    assert re.search(r"\| coord_simple \| train \| \S+→\S+ \(4\) \|", card)
     assert "coord_simple/H4. `cards/headroom.md`" in card, "no cell of cramped_down"
     for name in re.findall(r"!\[.*?\]\((.*?)\)", card):
         assert (published_release / name).read_bytes().startswith(b"\x89PNG"), name

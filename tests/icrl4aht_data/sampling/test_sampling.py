@@ -11,6 +11,7 @@ from icrl4aht_data import get_layout, load_icrl4aht
 from icrl4aht_data.benchmark.facts import all_families
 from icrl4aht_data.errors import MixedSplitsWarning, OptionError
 from icrl4aht_data.overcooked.state import record_size
+from icrl4aht_data.sampling.draws import Curriculum, HistoryDraws
 from tests.helpers.random_releases import random_release
 
 LENGTH = 32
@@ -183,6 +184,28 @@ def test_contexts_can_be_sampled_from_episodes_of_one_step(tmp_path):
     random_release(tmp_path / "r", layouts=("cramped_up",), episodes=9, length=1)
     batch = load_icrl4aht(tmp_path / "r").dpt(batch_size=4, context=9)[0]
     assert batch.context_next_obs.shape == (4, 9, 5, 5, 35)
+
+
+def test_dpt_context_fits_into_every_part_of_a_curriculum(two_sources):
+    """Half of 6 episodes touches 4 episodes at the first and the last batch, but 3 at batch 2."""
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
+    curriculum = Curriculum(9, (0.1, 0.6), (0.4, 0.9))
+    ranges = [HistoryDraws(dataset, "uniform", None, curriculum).steps(i) for i in (0, 2, 9)]
+    episodes = dataset.info.environment.kept_steps
+    assert [{*((high - low) // episodes).tolist()} for low, high in ranges] == [{4}, {3}, {4}]
+    with pytest.raises(OptionError, match=f"the shortest history has {3 * episodes} transitions"):
+        dataset.dpt(batch_size=8, context=3 * episodes + 1, curriculum=curriculum)
+    sampler = dataset.dpt(batch_size=8, context=3 * episodes, curriculum=curriculum)
+    assert all(sampler[i].context_actions.max() < 6 for i in range(10))
+
+
+def test_dpt_draws_no_history_of_weight_zero(two_sources):
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
+    tasks = dataset.column_codes("task_id")
+    weights = (tasks != tasks[-1]).astype(float)
+    sampler = dataset.dpt(batch_size=64, context=9, weights=weights)
+    drawn = np.unique(np.concatenate([part for i in range(8) for part in sampler._draw(i)[::2]]))
+    assert drawn.tolist() == np.flatnonzero(weights).tolist()
 
 
 def test_batch_larger_than_free_memory_is_refused(lite):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from filelock import Timeout
 
-from icrl4aht_data.utils.files import process_lock
+from icrl4aht_data.utils.files import lock_file_path, process_lock
 
 
 def increment_slowly(folder: Path, times: int) -> None:
@@ -38,3 +38,8 @@ def test_held_lock_raises_timeout_without_waiting(tmp_path):
             pass
         assert path.exists(), "who did not get the lock leaves its file"
     assert not path.exists()
+
+
+def test_lock_file_of_a_folder_is_next_to_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert lock_file_path(Path()) == lock_file_path(tmp_path) == tmp_path.with_name(f".{tmp_path.name}.lock")

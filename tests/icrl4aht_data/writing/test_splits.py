@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import RELEASE_CARD
 from icrl4aht_data.writing import splits
 from icrl4aht_data.writing.splits import SplitDistance, played_teammates, read_distances, teammates_hash
@@ -17,14 +15,7 @@ def test_distances_are_read_only_for_the_teammates_they_were_measured_with(tmp_p
     dataset = load_icrl4aht(two_sources[0])
     played = played_teammates(dataset.tasks.values(), dataset.provenance)
     stored = tmp_path / "distances.json"
-
-    def find_stored(name: str) -> Path:
-        if not stored.is_file():
-            raise OptionError(f"{name}: missing")
-        return stored
-
-    monkeypatch.setattr(splits, "card_file", find_stored)
-    assert read_distances(played) == {}
+    monkeypatch.setattr(splits, "card_file", lambda name: stored)
     layouts = {"demo_wide": {"train": 2, "validation": 2, "least": 0.25}}
     stored.write_text(json.dumps({"teammates": teammates_hash(played), "layouts": layouts}))
     assert read_distances(played) == {"demo_wide": SplitDistance(2, 2, 0.25)}
