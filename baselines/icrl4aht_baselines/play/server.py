@@ -148,7 +148,13 @@ class PlaySession:
     async def advance(self) -> None:
         """Take a step with the actions that people chose since the last step, and show the new state."""
         finished = len(self.game.returns)
-        self._reward = self.game.step(self._chosen)
+        try:
+            self._reward = self.game.step(self._chosen)
+        except Exception as error:  # of a trained or registered agent; the page would stop without a message
+            self._problem = f"The game has stopped, because an agent failed: {error!r}. Start `play` again."
+            self._pause()
+            await self.show()
+            raise
         self._chosen = {}
         if len(self.game.returns) > finished:
             self._pause()

@@ -148,6 +148,19 @@ def test_failed_record_write_is_shown_and_retried(tmp_path, monkeypatch):
     assert load_icrl4aht(tmp_path / "record")[0].entry.episodes == session.recorder.written == 2
 
 
+def test_failure_of_an_agent_is_shown(monkeypatch):
+    def fail(chosen: Any) -> float:
+        raise RuntimeError("no such layer")
+
+    session = new_session()
+    monkeypatch.setattr(session.game, "step", fail)
+    with make_client(session) as client, open_browser(client) as player:
+        player.act(STAY, STAY)
+        assert player.frame["problem"].startswith(
+            "The game has stopped, because an agent failed: RuntimeError('no such"
+        )
+
+
 def test_two_people_play_and_each_is_shown_as_agent_0():
     session = new_session("human")
     with make_client(session) as client, open_browser(client) as one:
