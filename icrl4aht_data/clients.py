@@ -130,13 +130,19 @@ class HubClient:
         is_offline = bool(offline_switches())
         return Path(hf_hub_download(self.repo, name, **options, local_files_only=is_offline, tqdm_class=HiddenBar))
 
-    def sizes(self, names: list[str]) -> list[int]:
-        """Return the sizes of files in bytes; 0 if the server does not report a size."""
+    def sizes(self, names: list[str]) -> list[int | None]:
+        """Return the sizes of files in bytes; None if the server does not report a size.
+
+        Raises:
+            FileNotFoundError: if the repository does not have a file.
+        """
         from huggingface_hub import HfApi
 
         info = HfApi().dataset_info(self.repo, revision=self.revision, files_metadata=True, timeout=_TIMEOUT)
         known = {file.rfilename: file.size for file in info.siblings or ()}
-        return [known.get(name) or 0 for name in names]
+        if absent := [name for name in names if name not in known]:
+            raise FileNotFoundError(", ".join(absent[:3]))
+        return [known[name] for name in names]
 
 
 class FsspecClient:
@@ -175,10 +181,10 @@ class FsspecClient:
         self._files.get_file(self._file_address(name), str(path), callback=Counter())
         return path
 
-    def sizes(self, names: list[str]) -> list[int]:
-        """Return the sizes of files in bytes; 0 if the server does not report a size."""
+    def sizes(self, names: list[str]) -> list[int | None]:
+        """Return the sizes of files in bytes; None if the server does not report a size."""
         assert self._files is not None
-        return [int(size or 0) for size in self._files.sizes(list(map(self._file_address, names)))]
+        return self._files.sizes(list(map(self._file_address, names)))
 
     def _file_address(self, name: str) -> str:
         path, mark, query = self._address.partition("?")

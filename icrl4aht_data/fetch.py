@@ -208,8 +208,8 @@ class Remote(ReleaseLocation):
         is_hashable = is_shard or path.stat().st_size <= disk.LARGEST  # a sparse file may be huge
         return is_hashable and disk.file_hash(path) == self.manifest[name]
 
-    def sizes(self, names: Iterable[str]) -> dict[str, int]:
-        """Return the size in bytes of each file, as reported by the remote; 0 for an unreported size.
+    def sizes(self, names: Iterable[str]) -> dict[str, int | None]:
+        """Return the size in bytes of each file, as reported by the remote; None for an unreported size.
 
         Raises:
             RemoteError: if the remote cannot be reached, or does not have a file.
@@ -432,7 +432,8 @@ def plan_download(
     index, names = read_index(remote.folder), sorted(chosen_files(remote, **wanted))
     present = {name: remote.path(name).stat().st_size for name in names if remote.path(name).exists()}
     sizes = {name: index.info.shards[name] for name in names if name in index.info.shards}
-    sizes = present | sizes | remote.sizes(name for name in names if name not in sizes and name not in present)
+    others = remote.sizes(name for name in names if name not in sizes and name not in present)
+    sizes = present | sizes | {name: size or 0 for name, size in others.items()}
     compared, changed = bar_updater(advance, "compare", sum(present.values())), []
     for name, size in present.items():
         if not remote.is_downloaded(name, by_hash=True):

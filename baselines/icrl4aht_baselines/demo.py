@@ -149,10 +149,10 @@ def conclusion(own: EvaluationRun, cleared: EvaluationRun) -> str:
     # Differences are paired by task and seed. Each combination of layout and teammate family has the same weight.
     rise = mean_interval(*(end - own.returns[cell].blocks["1"][0] for cell, end in ends.items()))
     memory = mean_interval(*(end - cleared.returns[cell].blocks[last][0] for cell, end in ends.items()))
-    verdict = "rises by memory" if rise.low > 0 and memory.low > 0 else "does not rise by memory"
+    verdict = "rises because of memory" if rise.low > 0 and memory.low > 0 else "does not rise because of memory"
     return (
-        f"Its return {verdict}: {rise.text(sign='+')} from the first episode to the last ones, which earn "
-        f"{memory.text(sign='+')} more than with memory cleared before each episode.\n"
+        f"Its return {verdict}: {rise.text(sign='+')} from the first episode to the last ones, and there "
+        f"{memory.text(sign='+')} above the return with memory cleared before each episode.\n"
         f"This is one training run, and the intervals leave out how much such runs differ. Validation tasks are for "
         f"choosing models, so this is no test result."
     )

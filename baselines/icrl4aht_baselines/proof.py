@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -32,6 +31,7 @@ from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, Tra
 from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import load_icrl4aht
+from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.utils.files import parse_json, read_json, read_text, write_json
 from icrl4aht_data.writing.proof import RUN_KEY, histories_hash, runs_on
 
@@ -150,7 +150,6 @@ class ProofJob(TrainingJob):
             "train": asdict(self.training),
             "protocol": PROOF_PROTOCOL.settings,
             "tasks": {track: [task.task_id for task in own] for track, own in self.options.tasks.items()},
-            "code_version": version("icrl4aht-data"),
         }
 
     def finished_text(self) -> str:
@@ -174,7 +173,9 @@ class ProofJob(TrainingJob):
 
 @cache
 def _histories_hash(root: str | None, source: str) -> str:
-    return histories_hash(load_icrl4aht(root).index, source)
+    dataset = load_icrl4aht(root)
+    dataset.origin.fetch([chunk_table_name(shard) for shard in dataset.index.values("shard")])
+    return histories_hash(dataset.index, source)
 
 
 def _training_seconds(timing: Path) -> float:
@@ -261,8 +262,9 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
     }
     before = read_json(path) if path.is_file() else {}
     if all(before.get(name) == content[name] for name in ("training", "tasks")):
-        earlier = runs_on(dataset.index, before.get("runs", []))
-        runs = [*{tuple(one[name] for name in RUN_KEY): one for one in (*earlier, *runs)}.values()]
+        earlier = [one for one in before.get("runs", []) if one.keys() >= {*RUN_KEY}]
+        runs = [*runs_on(dataset.index, earlier), *runs]
+    runs = [*{tuple(one[name] for name in RUN_KEY): one for one in runs}.values()]
     runs.sort(key=lambda one: [one[name] for name in RUN_KEY])
     write_json(path, content | {"runs": runs})
     return path

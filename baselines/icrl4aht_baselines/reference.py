@@ -1,7 +1,8 @@
 """Make the reference models, from a release of scripted histories to evaluated models and their cards.
 
     OUT/PROFILE/lite                    release that `icrl4aht-data generate --profile PROFILE` makes
-    OUT/agent-TRACK[-TEACHER]           histories of the teacher with falling noise, see `RL2_HISTORIES`
+    OUT/agent-TRACK[-TEACHER]           histories of the teacher with falling noise, see `RL2_HISTORIES`; TEACHER is the
+                                        name of a model, or the name and a hash of a folder's path
     OUT/NAME-TRACK-sSEED/run            run folder of the model NAME
     OUT/NAME-TRACK-sSEED/first          run folder of the first of two training runs of a model
     OUT/NAME-TRACK-sSEED/own            histories that the model of the first run plays, labelled by the teacher

@@ -118,5 +118,5 @@ def check_remote_sizes(remote: Remote, index: Index, shards: list[str], report: 
         return
     for name, found in sizes.items():
         expected = index.info.shards.get(name, found)  # `check_index` reports shards that are not in info.json
-        if found not in (0, expected):  # 0 if the server does not report the size
+        if found not in (None, expected):  # None if the server does not report the size
             report.add(name, f"expected {expected:,} bytes, found {found:,}")

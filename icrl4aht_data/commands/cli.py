@@ -21,6 +21,7 @@ from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown_name
 from icrl4aht_data.utils.files import FULL, describe_disk, final_name
 from icrl4aht_data.utils.install_hints import missing_library_message
 from icrl4aht_data.utils.plugins import Plugins
+from icrl4aht_data.utils.system import keep_freed_memory
 
 _REMEDIES = {
     errno.ENOENT: "check the path; a new file's folder has to exist",
@@ -128,6 +129,7 @@ click.version_option(package_name="icrl4aht-data", message="%(package)s %(versio
 
 def main() -> None:
     """Run the program on the command line's arguments."""
+    keep_freed_memory()
     run(cli)
 
 

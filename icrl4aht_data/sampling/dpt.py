@@ -79,9 +79,9 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         labels: "expert" or "oracle"; see `history.LABELS`.
         queries: Q, the number of queries for each context.
         options: options shared with `ADSampler`: `seed`; `teammate_actions`, whether batches have
-            `context_teammate_actions`; `weights`, probabilities of the histories of a task; `episodes` and
-            `curriculum`, the part of each history that queries and contexts are drawn from; `process_index` and
-            `process_count`.
+            `context_teammate_actions`; `weights`, probabilities of the histories of a task, which is never drawn if all
+            are 0; `episodes` and `curriculum`, the part of each history that queries and contexts are drawn from;
+            `process_index` and `process_count`.
 
     Warns:
         WeakLabelsWarning: for tasks whose labels come from a policy or an oracle that earns less than half of what

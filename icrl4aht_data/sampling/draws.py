@@ -151,7 +151,7 @@ class HistoryDraws:
     def fewest_steps(self) -> np.ndarray:
         """Return the number of steps in each history's range, int64 (H,); with a curriculum, a lower bound for it."""
         low, high = self.steps(0)
-        if self.curriculum is None:
+        if self.curriculum is None or self.curriculum.first == self.curriculum.last:
             return high - low
         first, stop = self._range
         # The part of a history that a curriculum selects grows or shrinks linearly.

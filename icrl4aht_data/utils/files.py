@@ -126,7 +126,7 @@ def read_json(path: Path) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        IndexFormatError: as `read_text` and `parse_json`; the message has the path.
+        IndexFormatError: if the file cannot be read, or is not JSON.
     """
     text = read_text(path)
     try:
@@ -332,7 +332,7 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
 
 
 def lock_file_path(folder: Path) -> Path:
-    """Return the path of a folder's lock file, which is next to the folder, so that a locked folder can be renamed."""
+    """Return the path of the lock file of a folder or file, next to it, so that a locked folder can be renamed."""
     folder = folder.resolve()  # "." has no name
     return folder.with_name(f".{folder.name}.lock")
 

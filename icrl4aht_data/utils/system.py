@@ -1,4 +1,4 @@
-"""Amount of free memory, a pool of threads, and the folders for cached arrays and fetched releases.
+"""Amount of free memory, reuse of memory, a pool of threads, and the folders for cached arrays and fetched releases.
 
 The cache folder is $ICRL4AHT_CACHE_DIR, else the user's cache folder (`platformdirs`); its size limit is
 $ICRL4AHT_CACHE_BYTES (100 GB by default). Release folders are not used as caches: they contain only files of the
@@ -7,6 +7,7 @@ manifest, and are often read-only. Deleting the cache folder is always safe.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 from collections.abc import Callable
@@ -20,6 +21,9 @@ import platformdirs
 from numpy.typing import DTypeLike
 
 from icrl4aht_data.errors import OptionError
+
+_KEEP_FREED_MEMORY = {-8: 1, -4: 0, -1: 2**31 - 1}
+"""Options of `mallopt` and values: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD, see <malloc.h>."""
 
 _PLENTY = 2**29  # bytes; smaller arrays are allocated without a check
 _CGROUP = Path("/sys/fs/cgroup")
@@ -44,6 +48,18 @@ def gigabytes(size: int) -> str:
     """Return a number of bytes as text, in GB."""
     number = size / 1e9
     return f"{number:,.0f} GB" if number >= 100 else f"{number:.3g} GB"
+
+
+def keep_freed_memory() -> None:
+    """Keep freed memory in this process for later allocations, instead of returning it to the system; needs glibc.
+
+    XLA programs on CPUs allocate memory for intermediate arrays in each call, and page faults then take up to a third
+    of a training step. Call this function before other threads start.
+    """
+    with suppress(TypeError, OSError, AttributeError):  # the C library is not glibc
+        set_option = ctypes.CDLL(None).mallopt
+        for option, value in _KEEP_FREED_MEMORY.items():
+            set_option(option, value)
 
 
 def free_memory() -> int:

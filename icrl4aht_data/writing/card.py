@@ -25,6 +25,7 @@ from icrl4aht_data.benchmark.facts import (
     PAPER_TEAMMATE_STEPS,
     PAPER_TEAMMATES,
     SAME_BEHAVIOUR,
+    SCRIPTED_SOURCES,
     SOURCES,
     SPLITS,
     SPREAD_SEED,
@@ -223,6 +224,7 @@ def card_facts(root: Path) -> dict[str, Any]:
         "weak": Counter((titles[task.first.layout], task.first.source) for task in tasks if task.has_weak_labels),
         "left_out": [asdict(task) for task in info.left_out],
         "headroom": headroom,
+        "scripted": (None, *SCRIPTED_SOURCES),  # None: noise histories of earlier versions
         "proof": read_proof(root),
         "flat_cells": [
             "/".join(cell) for cell in cells_without_headroom(read_reference_returns(HEADROOM_PROTOCOL), tested)

@@ -67,7 +67,7 @@ def fake_evaluate(last: float, last_cleared: float):
 
 @pytest.mark.parametrize(
     ("last", "last_cleared", "verdict"),
-    [(20.0, 0.0, "rises by"), (20.0, 20.0, "does not rise by"), (-10.0, -30.0, "does not rise by")],
+    [(20.0, 0.0, "rises"), (20.0, 20.0, "does not rise"), (-10.0, -30.0, "does not rise")],
 )
 def test_conclusion_says_whether_memory_raises_the_return(last, last_cleared, verdict, tmp_path):
     evaluate = fake_evaluate(last, last_cleared)
@@ -78,7 +78,7 @@ def test_conclusion_says_whether_memory_raises_the_return(last, last_cleared, ve
         )
         write_tasks(out / "tasks.jsonl", TASKS)
     said = demo.conclusion(results.read_run(tmp_path / "None"), results.read_run(tmp_path / "cleared"))
-    assert said.startswith(f"Its return {verdict} memory: {last + 1.5:+.1f}")
+    assert said.startswith(f"Its return {verdict} because of memory: {last + 1.5:+.1f}")
 
 
 @pytest.mark.slow
@@ -90,7 +90,7 @@ def test_demo_prints_every_step_and_writes_all_files(release, tmp_path, monkeypa
     said = capsys.readouterr().out
     for expected in ("1/6", "target_actions", "transitions replayed", "6/6", "done in", str(page)):
         assert expected in said, expected
-    assert "Its return rises by memory: +21.5" in said
+    assert "Its return rises because of memory: +21.5" in said
     assert "search, mean return in episodes 1: -20.0, 2-5: 41.5, 6-20: 41.5\n" in said
     assert (tmp_path / "adaptation.png").read_bytes()[1:4] == b"PNG"
     assert "validation tasks</h3>" in page.read_text()

@@ -277,8 +277,8 @@ def proof_command(root: Any, histories: tuple[str, ...], learner: tuple[str, ...
     """
     from icrl4aht_baselines.proof import LEARNERS, ProofJob, ProofOptions, run_references, write_proof
 
-    chosen = ProofOptions(root and str(root))
-    models = [(source, name) for source in histories for name in learner or LEARNERS]
+    chosen = ProofOptions(str(root.resolve()) if isinstance(root, Path) else root)
+    models = dict.fromkeys((source, name) for source in histories for name in learner or LEARNERS)
     jobs = [ProofJob(source, name, seed, chosen, out) for seed in range(seeds) for source, name in models]
     references = run_references(chosen, out)
 

@@ -65,7 +65,7 @@ from icrl4aht_data.utils.text import counted_noun
 )
 @click.option(
     "--number",
-    type=click.IntRange(0, 19),
+    type=click.IntRange(0, 9),
     default=0,
     help="Number of the collection. Releases with different numbers have different tasks, so they can be combined.",
 )
@@ -197,6 +197,8 @@ def reference_command(
                 "--bundle-as: expected one --name, all tracks, one seed and an evaluation, because the card states its "
                 "results; leave out --track, --seeds and --no-evaluate"
             )
+    if teacher and Path(teacher).is_dir():
+        teacher = str(Path(teacher).resolve())
     if teacher:  # reports an invalid name now, not after hours of work
         find_agent(teacher)
         for name in names:

@@ -57,7 +57,7 @@ from icrl4aht_data.writing.release_folder import check_target
 SOURCE = "agent"
 
 FIRST_SEED = 3_000_000
-"""Seed of the first task of source `agent`; tasks of other sources have smaller seeds."""
+"""Seed of the first task of source `agent`; ten collections fit below the seeds of source `search`."""
 
 _SEEDS = 100_000
 """Size of the range of task seeds that is reserved for one collection."""

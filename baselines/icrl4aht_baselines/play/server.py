@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import os
 import socket
 from collections.abc import AsyncIterator, Callable
@@ -83,7 +84,7 @@ class PlaySession:
         self._ready: set[int] = set()
         self._views = {VIEWS[0] if recorder else VIEWS[1]}  # views shown in this episode; `_view` is the current one
         self._view = next(iter(self._views))
-        self._reward, self._problem, self._moving = 0, "", asyncio.Event()
+        self._reward, self._problem, self._failed, self._moving = 0, "", False, asyncio.Event()
         start = [game.record, swap_agents(game.record)]
         self._layout = [layout_drawings(game.layout, record[None]) for record in start]
 
@@ -150,11 +151,12 @@ class PlaySession:
         finished = len(self.game.returns)
         try:
             self._reward = self.game.step(self._chosen)
-        except Exception as error:  # of a trained or registered agent; the page would stop without a message
-            self._problem = f"The game has stopped, because an agent failed: {error!r}. Start `play` again."
+        except Exception as error:  # agents can be any code; without a message the page would only stop
+            logging.getLogger(__name__).exception("an agent failed")
+            self._problem, self._failed = f"The game has stopped, because an agent failed: {error!r}.", True
             self._pause()
             await self.show()
-            raise
+            return
         self._chosen = {}
         if len(self.game.returns) > finished:
             self._pause()
@@ -242,7 +244,7 @@ class PlaySession:
 
     async def _act(self, slot: int, action: int) -> None:
         """Store a person's action for the next step. While the game waits, any action marks the person as ready."""
-        if self.game.is_over or (self.recorder and self.recorder.pseudonym is None):
+        if self._failed or self.game.is_over or (self.recorder and self.recorder.pseudonym is None):
             return
         if not self._moving.is_set():
             self._ready.add(slot)

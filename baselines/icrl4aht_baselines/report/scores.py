@@ -475,6 +475,8 @@ def _missing_score_reason(run: EvaluationRun, cells: Sequence[ResultCell], scale
         return f"No score: best responses were measured under protocol {measured.protocol}."
     if not known:
         return "No score: no best response measured."
+    if any(run.source(cell).detail(CONTROLS["swapped"]) for cell in known):
+        return "No score: in this control, another teammate plays most episodes."
     if not any(scales[cell].has_headroom for cell in known):
         return f"No score: no best response earns {LEAST_HEADROOM:g} more than `stay` in these cells."
     return f"No score: it needs all tasks of a cell with a best response, in episodes of {KEPT_STEPS} steps."

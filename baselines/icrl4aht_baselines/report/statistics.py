@@ -109,7 +109,7 @@ def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMP
     resampled = [[_resample(stratum, resamples, rng) for stratum in group] for group in groups]
     with np.errstate(divide="ignore", invalid="ignore"):
         means, variances = _estimate(resampled, drawn)
-        variances[variances < 1e-3 * variance] = 0.0  # left out: nearly equal units give any studentized value
+        variances[variances < 1e-9 * variance] = 0.0  # rounding errors; such resamples are left out
         studentized = (means - mean) / np.sqrt(variances)
     studentized = studentized[np.isfinite(studentized)]
     error = float(np.sqrt(variance))

@@ -27,7 +27,7 @@ class CollectionJob:
         profile: profile that the unit belongs to.
         artefacts: folder of all artefacts.
         suite: folder of the learned teammates; None if no task has a learned teammate.
-        layouts: all generated layouts of the profile, since every worker compiles for the largest of these layouts.
+        layouts: all generated layouts of the rebuild, since every worker compiles for the largest of these layouts.
     """
 
     work: WorkUnit

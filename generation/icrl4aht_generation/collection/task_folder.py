@@ -35,7 +35,7 @@ from icrl4aht_data.format.cached_arrays import new_mapped_array
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
-from icrl4aht_data.utils.files import NO_ROOM, atomic_write, file_hash, hashes_match, json_hash, read_json, write_json
+from icrl4aht_data.utils.files import NO_ROOM, file_hash, hashes_match, json_hash, read_json, write_json
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic
@@ -211,8 +211,7 @@ def finish_artefact(partial: Path, work: WorkUnit, profile: Profile) -> None:
         "xla_threads": xla_threads(),
         "files": {name: file_hash(partial / name) for name in hashed_files(work, profile)},
     }
-    with atomic_write(partial / METADATA) as unnamed:
-        write_json(unnamed, metadata)
+    write_json(partial / METADATA, metadata)
 
 
 def publish_artefact(partial: Path, folder: Path) -> None:

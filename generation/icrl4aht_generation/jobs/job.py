@@ -10,6 +10,7 @@ from typing import Any, Literal, Protocol
 
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.utils.files import NO_ROOM, atomic_write, lock_file_path, process_lock, read_text
+from icrl4aht_data.utils.system import keep_freed_memory
 from icrl4aht_generation.jobs.options import request_determinism
 from icrl4aht_generation.learners.resume import BusyError, limit_xla_threads
 
@@ -108,6 +109,7 @@ def run_job(job: Job, wait: bool, on_update: OnUpdate = lambda update, speed: No
 
 def run_in_worker(job: Job, wait: bool) -> Literal["done", "busy"]:
     """Run a job in a worker process, in which all jobs have the same number of XLA threads."""
+    keep_freed_memory()
     request_determinism()
     if job.xla_threads:
         limit_xla_threads(job.xla_threads)

@@ -46,7 +46,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
     Jobs that another process is running are skipped at first, and awaited at the end.
 
     Args:
-        jobs: jobs of the queue, all with the same number of XLA threads.
+        jobs: jobs of the queue, all with the same number of XLA threads. Jobs of the same name count as one.
         out: folder of the log of failures.
         console: where outcomes are printed.
         options: how to run the jobs.
@@ -54,6 +54,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
     Raises:
         FailedJobsError: if a job is unfinished at the end; out/failed.jsonl lists the reasons.
     """
+    jobs = [*{job.name: job for job in jobs}.values()]
     labels = {job.name: f"{number}/{len(jobs)} {job.label}" for number, job in enumerate(jobs, start=1)}
     todo = []
     for job in jobs:
@@ -77,7 +78,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
                 continue
             if outcome.status == "done":
                 console.print(f"{labels[name]}: {outcome.job.finished_text()}")
-                missing.discard(name)
+                missing.remove(name)
                 lines[name] = None
             else:
                 last_error, attempts = outcome.error, outcome.attempts

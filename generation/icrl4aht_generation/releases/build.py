@@ -75,8 +75,8 @@ def build_releases(
         units, headroom, left_out = train_teammates(profile, suite, seed, console, options)
     else:
         units, headroom, left_out = profile.units_of(tasks, sources or {}), {}, []
-    names = dict.fromkeys([*profile.layouts, *(work.task.layout.name for work in units)])
-    generated = tuple(get_layout(name) for name in names if name not in LAYOUTS)
+    played = dict.fromkeys([*profile.layouts, *(work.task.layout.name for work in units)])
+    generated = tuple(get_layout(name) for name in played if name not in LAYOUTS)
     jobs = [CollectionJob(work, profile, out / "artefacts", suite, generated) for work in units]
     run_jobs(jobs, out, console, options)
     tasks = list({work.task.task_id: work.task for work in units}.values())

@@ -148,17 +148,22 @@ def test_failed_record_write_is_shown_and_retried(tmp_path, monkeypatch):
     assert load_icrl4aht(tmp_path / "record")[0].entry.episodes == session.recorder.written == 2
 
 
-def test_failure_of_an_agent_is_shown(monkeypatch):
+@pytest.mark.parametrize("error", [RuntimeError, ValueError])
+def test_failure_of_an_agent_is_shown_and_logged(error, monkeypatch, caplog):
+    steps: list[Any] = []
+
     def fail(chosen: Any) -> float:
-        raise RuntimeError("no such layer")
+        steps.append(chosen)
+        raise error("no such layer")
 
     session = new_session()
     monkeypatch.setattr(session.game, "step", fail)
     with make_client(session) as client, open_browser(client) as player:
         player.act(STAY, STAY)
-        assert player.frame["problem"].startswith(
-            "The game has stopped, because an agent failed: RuntimeError('no such"
-        )
+        assert player.frame["problem"].startswith("The game has stopped, because an agent failed: " + error.__name__)
+        player.socket.send_json({"action": STAY})  # ignored, without an answer
+        assert player.send(unknown=1)["kind"] == "problem"
+    assert len(steps) == 1 and "no such layer" in caplog.text
 
 
 def test_two_people_play_and_each_is_shown_as_agent_0():

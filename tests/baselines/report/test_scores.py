@@ -171,7 +171,7 @@ def test_results_of_the_control_swapped_have_no_score(invented_responses):
     run = evaluated_run("mine (swapped)", details={"swapped": True})
     assert {*run.table["control"]} == {"swapped"}
     (found,) = scores.find_headlines(run)
-    assert found.score is None
+    assert found.score is None and found.why_no_score.startswith("No score: in this control, another teammate plays")
     rows = scores.add_scales(run.table)
     assert {*rows[rows["best"].notna()]["block"]} == {"last 20"}
     (cleared,) = scores.find_headlines(evaluated_run("mine (cleared)", details={"forget": True}))

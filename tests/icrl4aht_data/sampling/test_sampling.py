@@ -196,7 +196,12 @@ def test_dpt_context_fits_into_every_part_of_a_curriculum(two_sources):
     with pytest.raises(OptionError, match=f"the shortest history has {3 * episodes} transitions"):
         dataset.dpt(batch_size=8, context=3 * episodes + 1, curriculum=curriculum)
     sampler = dataset.dpt(batch_size=8, context=3 * episodes, curriculum=curriculum)
-    assert all(sampler[i].context_actions.max() < 6 for i in range(10))
+    for i in range(10):
+        low, high = HistoryDraws(dataset, "uniform", None, curriculum).steps(i)
+        _, _, context, steps = sampler._draw(i)
+        assert (steps >= low[context][:, None]).all() and (steps < high[context][:, None]).all()
+    constant = Curriculum(9, (0.1, 0.6), (0.1, 0.6))
+    dataset.dpt(batch_size=8, context=4 * episodes, curriculum=constant)  # no batch has fewer than 4 episodes
 
 
 def test_dpt_draws_no_history_of_weight_zero(two_sources):
