@@ -141,11 +141,17 @@ class ProofJob(TrainingJob):
         return _FIRST_EPISODES if self.source == "search" else 0  # other histories improve to the last episode
 
     @property
+    def queries(self) -> int:
+        """Number of queries of each context: DPT has one for every prefix, so that it learns as many labels as AD."""
+        return self.options.context + 1 if LEARNERS[self.learner].method == "dpt" else 1
+
+    @property
     def settings(self) -> dict[str, Any]:
         """All settings that the result depends on, as JSON."""
         return {
             "histories_sha256": _histories_hash(self.options.root, self.source),
             "first": self.first,
+            "queries": self.queries,
             "model": asdict(_MODEL),
             "train": asdict(self.training),
             "protocol": PROOF_PROTOCOL.settings,
@@ -161,9 +167,8 @@ class ProofJob(TrainingJob):
         """Train and evaluate the model. Return the `minutes` of training, and the `returns` from `evaluate_on_sets`."""
         learner, run = LEARNERS[self.learner], self.run_folder
         source = () if self.source == "all" else (self.source,)
-        histories = HistoryOptions(
-            (ALL_LAYOUTS,), self.options.root, source=source, labels=learner.labels, first=self.first
-        )
+        chosen: dict[str, Any] = {"source": source, "labels": learner.labels, "first": self.first}
+        histories = HistoryOptions((ALL_LAYOUTS,), self.options.root, queries=self.queries, **chosen)
         prepare(learner.method, _MODEL, self.training, histories).train(run, done=self.step_progress(on_update))
         return {
             "minutes": round(_training_seconds(run / TIMING) / 60, 1),
