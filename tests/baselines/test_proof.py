@@ -17,6 +17,7 @@ from icrl4aht_data.writing import proof
 from icrl4aht_data.writing.card import card_facts, render_card
 from icrl4aht_data.writing.proof import histories_hash, proof_table, read_proof
 from tests.helpers.random_releases import random_release
+from tests.servers.http import http_server
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +80,16 @@ def test_proof_has_an_entry_for_each_training_run_and_keeps_comparable_ones(rele
     assert len(written(own)) == 2, "an entry of other histories is removed"
     changed = finish(replace(own, options=replace(options, steps=3)), 0.0)
     assert len(written(changed)) == 1, "the settings of the earlier runs differ"
+
+
+def test_job_on_a_release_at_an_address_names_its_histories(release, tmp_path, monkeypatch):
+    """Opening a remote release fetches its index only; the hash of its histories needs the tables of chunks, too."""
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
+    with http_server(release) as server:
+        job = ProofJob("ppo", "dpt-expert", 0, replace(small_options(release), root=server.url), tmp_path)
+        assert job.settings["histories_sha256"] == histories_hash(read_index(release), "ppo")
+    assert job.queries == job.options.context + 1 == 21
+    assert ProofJob("ppo", "ad", 0, job.options, tmp_path).queries == 1
 
 
 def test_dataset_card_shows_only_results_of_models_trained_on_its_release(release, tmp_path, monkeypatch):

@@ -166,9 +166,11 @@ def search_proof() -> tuple[float, ...]:
     )
 
 
-def agent_proof() -> tuple[float, float]:
-    """Return the shares that AD on `agent` histories earns with `expert` labels, and with own actions."""
-    return proof_mean("agent", "AD", "expert", "share"), proof_mean("agent", "AD", "own", "share")
+def agent_proof() -> tuple[float, float, float]:
+    """Return the shares that AD earns on `agent` histories with `expert` labels, with own actions, and on all."""
+    models = (("agent", "AD", "expert"), ("agent", "AD", "own"), ("all", "AD", "expert"))
+    first, second, third = (proof_mean(*model, "share") for model in models)
+    return first, second, third
 
 
 def training_teammates_like_tests() -> tuple[int, ...]:
@@ -229,7 +231,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/index", "{} test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/adapters", "{} published test tasks", lambda: len(bundled_tasks("test"))),
     ("docs/protocol", "plays {} episodes of {} steps", lambda: (SEEDED.episodes, SEEDED.steps)),
-    ("docs/training", "AD earned {} of .. on track `teammate` ({} without", agent_proof),
+    ("docs/training", "AD earned {} of .. on track `teammate` ({} without `expert` labels, {} with all", agent_proof),
     ("docs/evaluating", "the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
     ("docs/protocol", "up to {} [drawn", max_validation_tasks_per_layout),
     ("docs/protocol", "{} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),
