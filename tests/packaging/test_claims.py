@@ -220,7 +220,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/protocol", "return is larger, up to +{}, but", lambda: max(gains_of_best_responses().values())),
     (
         "docs/preference",
-        "return on the {} validation .. was {} in episode 1 and {} in .. ; {} with memory",
+        "return on the {} validation .. was {} in episode 1 and {} in ..; {} with memory",
         search_proof,
     ),
     (
