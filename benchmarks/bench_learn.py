@@ -54,6 +54,7 @@ from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.sampling.ad import ADBatch, ADSampler
+from icrl4aht_data.utils.system import keep_freed_memory
 from icrl4aht_data.writing.published import FROM_PUBLISHED, to_published
 
 _UPDATES, _PEER_UPDATES = 3, 2  # updates per measured call
@@ -250,6 +251,7 @@ def main(
     """Measure the speed of training egos and of training and evaluating sequence models; print JSON lines."""
     if "jaxmarl" in parts and not peer:
         raise click.UsageError("--part jaxmarl: expected --peer FILE, a copy of JaxMARL's ippo_rnn_overcooked_v2.py")
+    keep_freed_memory()  # as all commands do
     parts, here = parts or tuple(part for part in PARTS_OF_LEARNING if peer or part != "jaxmarl"), get_layout(layout)
     loaded = {profile.name: profile for profile in map(load_profile, profiles)}
     threads = [profile.xla_threads for profile in loaded.values() if profile.xla_threads]
