@@ -197,13 +197,12 @@ def reference_command(
                 "--bundle-as: expected one --name, all tracks, one seed and an evaluation, because the card states its "
                 "results; leave out --track, --seeds and --no-evaluate"
             )
-    if teacher and Path(teacher).is_dir():
-        teacher = str(Path(teacher).resolve())
-    if teacher:  # reports an invalid name now, not after hours of work
-        find_agent(teacher)
+    out = out.resolve()  # workers on a cluster have other working directories
+    if teacher:
+        teacher = str(Path(teacher).resolve()) if Path(teacher).is_dir() else teacher
+        find_agent(teacher)  # reports an invalid name now, not after hours of work
         for name in names:
             check_learns_from_teacher(name)
-    out = out.resolve()  # workers on a cluster have other working directories
     threads = 1 if options.workers or options.executor == "ray" else None  # a single job may use all cores
     jobs = [
         ReferenceJob(name, of_track, seed, out, teacher, threads)

@@ -155,10 +155,10 @@ def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
     return [task for task in tasks if task.task_id in chosen]
 
 
-Control = Literal["cleared", "swapped"]
 SUBMITTED_SEEDS = (0, 1, 2)
 """Seeds that every task of a submission must be played with; best responses are reported with the same seeds."""
 
+Control = Literal["cleared", "swapped"]
 CONTROLS: dict[Control, str] = {"cleared": "forget", "swapped": "swapped"}
 """Name of a control -> key that marks its results in their `details`. `cleared`: the ego's memory is cleared before
 each episode. `swapped`: another task's teammate plays all episodes but the last, see `Protocol.last_episodes`."""

@@ -184,7 +184,7 @@ def _bar_chart(
         drawn = [_make_bar(number, shown[number], cell, found, scale, digits) for number, found in of_cell.items()]
         bars[cell.layout].append(BarRow(family_title(cell.family), drawn, ranges.get(cell, "")))
     several = any(bar.interval for rows in bars.values() for row in rows for bar in row.bars)
-    lines = ["Lines: 95 % intervals."] * several
+    lines = ["Lines: 95 % intervals over behaviours, or over seeds."] * several
     return Chart(title, " ".join([*lines, about]).rstrip(), _labelled_series(shown, cells), scale.ticks(), bars=bars)
 
 

@@ -179,7 +179,7 @@ def test_results_of_the_control_swapped_have_no_score(invented_responses):
 
 
 def test_behaviours_are_the_units_of_the_interval_of_a_mean_return():
-    """The five teammates of family H4 act alike, so seeds are resampled, of which there is one."""
+    """The five H4 teammates have the same behaviour, and the run has one seed, so the mean return has no interval."""
     same, different = (evaluated_run("mine", families=(family,)).returns for family in ("H4", "H1"))
     assert np.isnan(scores.mean_return(same.values()).low)
     assert scores.mean_return(different.values())[:3] == pytest.approx((11.0, 11.0, 11.0))
