@@ -146,12 +146,18 @@ class ProofJob(TrainingJob):
         return self.options.context + 1 if LEARNERS[self.learner].method == "dpt" else 1
 
     @property
+    def balance(self) -> bool:
+        """Whether windows are drawn from each source equally often; four fifths of the histories are of `search`."""
+        return self.source == "all" and LEARNERS[self.learner].method != "dpt"
+
+    @property
     def settings(self) -> dict[str, Any]:
         """All settings that the result depends on, as JSON."""
         return {
             "histories_sha256": _histories_hash(self.options.root, self.source),
             "first": self.first,
             "queries": self.queries,
+            "balance": self.balance,
             "model": asdict(_MODEL),
             "train": asdict(self.training),
             "protocol": PROOF_PROTOCOL.settings,
@@ -168,7 +174,8 @@ class ProofJob(TrainingJob):
         learner, run = LEARNERS[self.learner], self.run_folder
         source = () if self.source == "all" else (self.source,)
         chosen: dict[str, Any] = {"source": source, "labels": learner.labels, "first": self.first}
-        histories = HistoryOptions((ALL_LAYOUTS,), self.options.root, queries=self.queries, **chosen)
+        drawn: dict[str, Any] = {"queries": self.queries, "balance": self.balance}
+        histories = HistoryOptions((ALL_LAYOUTS,), self.options.root, **drawn, **chosen)
         prepare(learner.method, _MODEL, self.training, histories).train(run, done=self.step_progress(on_update))
         return {
             "minutes": round(_training_seconds(run / TIMING) / 60, 1),

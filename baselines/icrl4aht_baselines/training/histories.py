@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pandas as pd
 from icrl4aht_generation.learners.config import EncoderKind
 from icrl4aht_generation.learners.resume import Checkpoints, differing_settings
@@ -232,6 +233,10 @@ def _sampler(
                 f"every = {every}: {method.name} learns from contexts, but only windows can skip episodes; leave out "
                 "--every"
             )
+        if histories.balance:
+            raise OptionError(
+                f"balance = True: {method.name} draws tasks, but only windows can be drawn by source; leave out --balance"
+            )
         return dataset.dpt(context=options.context, order=histories.order, queries=histories.queries, **shared)
     if histories.queries > 1:
         raise OptionError(
@@ -244,7 +249,15 @@ def _sampler(
             f"context = {options.context}: the shortest history of {dataset!r} has {steps} steps for a window, with "
             f"every = {every} and first = {histories.first or 'all'}; reduce the context, or choose longer histories"
         )
-    return dataset.ad(length=options.context, every=every, **shared)
+    return dataset.ad(
+        length=options.context, every=every, weights=_balanced(dataset) if histories.balance else "uniform", **shared
+    )
+
+
+def _balanced(dataset: Dataset) -> np.ndarray:
+    """Return weights of the histories that are equal in sum for each source, float64 (H,)."""
+    _, source, counts = np.unique(dataset.column("source"), return_inverse=True, return_counts=True)
+    return 1 / counts[source]
 
 
 class HistorySplit(NamedTuple):

@@ -179,6 +179,7 @@ class HistoryOptions:
             default="all",
         ),
     ] = 0
+    balance: Annotated[bool, Option("Draw windows from each source equally often, not from each history.")] = False
     held_out: Annotated[
         float,
         Meta(gt=0, lt=1),

@@ -321,6 +321,13 @@ class TestHeldOut:
         dpt = training_job(two_sources[0], "dpt", context=40, queries=3)
         assert dpt.data.train[0].query_target.shape == (OPTIONS.batch_size, 3)
 
+    def test_balance_gives_all_sources_the_same_probability(self):
+        sampler = training_job(None, layout="demo_wide", balance=True).data.train
+        sources, weights = sampler.dataset.column("source"), np.array(sampler.options()["weights"])
+        counts = {source: np.sum(sources == source) for source in ("ppo", "noise", "agent")}
+        assert len({*counts.values()}) > 1
+        np.testing.assert_allclose([np.sum(weights[sources == source]) for source in counts], 1)
+
     def test_a_single_teammate_is_not_held_out(self):
         dataset = load_icrl4aht(layout="asymm_both_plain")
         dataset = dataset.filter(task_id=dataset.entries[0].task_id)[:5]
@@ -369,6 +376,7 @@ class TestHeldOut:
             ("ad", 41, {"every": 3}, "context = 41: .* has 40 steps .* every = 3 and first = all;"),
             ("ad", 61, {"first": 3}, "context = 61: .* has 60 steps .* every = 1 and first = 3;"),
             ("dpt", 7, {"every": 2}, "every = 2: dpt learns from contexts, but only windows can skip episodes"),
+            ("dpt", 7, {"balance": True}, "balance = True: dpt draws tasks, but only windows can be drawn by source"),
             ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
             ("ad", 7, {"order": "random"}, "order = random: ad learns from windows in order"),
         ],
