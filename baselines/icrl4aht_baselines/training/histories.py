@@ -235,7 +235,8 @@ def _sampler(
             )
         if histories.balance:
             raise OptionError(
-                f"balance = True: {method.name} draws tasks, but only windows can be drawn by source; leave out --balance"
+                f"balance = True: {method.name} draws tasks, but only windows can be drawn by source; leave out "
+                "--balance"
             )
         return dataset.dpt(context=options.context, order=histories.order, queries=histories.queries, **shared)
     if histories.queries > 1:
