@@ -10,8 +10,8 @@ Each training is a job of a queue. Finished jobs are reused, and stopped jobs re
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -32,8 +32,8 @@ from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.format.chunks import chunk_table_name
-from icrl4aht_data.utils.files import parse_json, read_json, read_text, write_json
-from icrl4aht_data.writing.proof import RUN_KEY, histories_hash, runs_on
+from icrl4aht_data.utils.files import json_hash, parse_json, read_json, read_text, write_json
+from icrl4aht_data.writing.proof import RUN_KEY, histories_hash
 
 TEAMMATE_TRACK = "teammate"
 
@@ -164,6 +164,13 @@ class ProofJob(TrainingJob):
             "tasks": {track: [task.task_id for task in own] for track, own in self.options.tasks.items()},
         }
 
+    @property
+    def settings_hash(self) -> str:
+        """Hash of all settings except the seed, which is equal for the runs of a row of the card's table."""
+        settings = self.settings
+        del settings["train"]["seed"]
+        return json_hash(settings)
+
     def finished_text(self) -> str:
         """Return text for progress displays: mean returns on the track `preference`."""
         returns = self.result()["returns"]
@@ -241,10 +248,10 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
         jobs: training jobs; unfinished jobs are skipped.
         references: returns from `run_references`.
         path: path of the file. An earlier file keeps the entries of other training runs, if these runs had the same
-            training settings and numbers of tasks, and learned from the same histories.
+            settings and learned from the same histories.
     """
     stay, reference = (references[TEAMMATE_TRACK][name]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
-    options, dataset, runs = jobs[0].options, load_icrl4aht(jobs[0].options.root), []
+    options, runs = jobs[0].options, []
     for job in (job for job in jobs if job.is_finished()):
         learner, result = LEARNERS[job.learner], job.result()
         returns = result["returns"]
@@ -254,6 +261,7 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
             "labels": learner.labels or "own",
             "seed": job.seed,
             "histories_sha256": job.settings["histories_sha256"],
+            "settings_sha256": job.settings_hash,
             "minutes": result["minutes"],
         }
         share = (returns[TEAMMATE_TRACK]["all"] - stay) / (reference - stay)
@@ -267,19 +275,24 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
             }
         )
     content: dict[str, Any] = {
-        "data_version": dataset.info.data_version,
+        "data_version": load_icrl4aht(options.root).info.data_version,
         "training": {"steps": options.steps, "batch_size": options.batch_size, "context": options.context},
         "tasks": {name: len(tasks) for name, tasks in options.tasks.items()},
         "references": references[PREFERENCE],
     }
-    before = read_json(path) if path.is_file() else {}
-    if all(before.get(name) == content[name] for name in ("training", "tasks")):
-        earlier = [one for one in before.get("runs", []) if one.keys() >= {*RUN_KEY}]
-        runs = [*runs_on(dataset.index, earlier), *runs]
+    earlier = read_json(path)["runs"] if path.is_file() else []
+    runs = [*(one for one in earlier if one.get("settings_sha256") == _job_of(one, jobs[0]).settings_hash), *runs]
     runs = [*{tuple(one[name] for name in RUN_KEY): one for one in runs}.values()]
     runs.sort(key=lambda one: [one[name] for name in RUN_KEY])
     write_json(path, content | {"runs": runs})
     return path
+
+
+def _job_of(entry: Mapping[str, Any], job: ProofJob) -> ProofJob:
+    """Return the job of an entry in a file of results, with the options of another job."""
+    wanted = ProofLearner(entry["method"].lower(), None if entry["labels"] == "own" else entry["labels"])
+    (learner,) = (name for name, one in LEARNERS.items() if one == wanted)
+    return replace(job, source=entry["histories"], learner=learner, seed=entry["seed"])
 
 
 def run_references(options: ProofOptions, out: Path) -> dict[str, dict[str, dict[str, float]]]:

@@ -332,7 +332,9 @@ class ReferenceJob(TrainingJob):
         if not mixed.is_dir():
             if not own.is_dir():
                 teammates, agent = self.teammates(number=1), find_agent(first, greedy=False)
-                collect_release(agent, teammates, OWN_HISTORIES, own, labeller=find_agent(self.trained_teacher()))
+                collect_release(
+                    agent, teammates, OWN_HISTORIES, own, labeller=find_agent(self.trained_teacher(), greedy=True)
+                )
             combine_releases(mixed, [histories, own])
         return mixed
 

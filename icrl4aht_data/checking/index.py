@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import SCRIPTED_SOURCES, kind_family
-from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.benchmark.tasks import Task, teammate_id
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import ReleaseInfo, layout_statistics, make_info
@@ -96,7 +95,7 @@ def _check_disjoint_teammates(tasks: Iterable[Task], report: Report) -> None:
     """Check that no task of another split has the teammate of a training task on the same track and layout."""
     seen: dict[tuple[str, str, str], str] = {}
     for task in sorted(tasks, key=lambda task: task.split != "train"):  # training tasks come first
-        key = (task.track, task.layout.name, json.dumps(task.teammate, sort_keys=True))
+        key = (task.track, task.layout.name, teammate_id(task.teammate))
         if task.split == "train":
             seen[key] = task.task_id
         elif key in seen:
@@ -141,7 +140,7 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
         for fault in _contradictions(provenance[task_id], entries, seeds.get(task_id)):
             report.add(PROVENANCE, f"task {task_id!r}: {fault}")
         for entry in entries:
-            for name, expected in provenance[task_id].entry_fields(entry.episodes).items():
+            for name, expected in provenance[task_id].entry_fields(entry.episodes, entry.has_expert_actions).items():
                 if (value := getattr(entry, name)) != expected:
                     where = f"history {entry.history_id}: {name}"
                     report.add(HISTORIES, f"{where} {value}, but {PROVENANCE} has {expected} of its task")

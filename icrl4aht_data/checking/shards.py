@@ -45,7 +45,7 @@ def check_chunks(shard: Shard, report: Report) -> set[int]:
 
 
 def check_history(
-    history: History, layout: Layout, info: ReleaseInfo, contents: dict[tuple[str, bytes], int], report: Report
+    history: History, layout: Layout, info: ReleaseInfo, contents: dict[bytes, int], report: Report
 ) -> None:
     """Check the content of one history; the chunks must be valid.
 
@@ -53,8 +53,8 @@ def check_history(
         history: the history.
         layout: the history's layout, with the recipes of the task.
         info: the release's info.
-        contents: (task id, hash of the history's records and actions) -> history id, for the histories checked so far;
-            this history is added.
+        contents: hash of a history's records and actions -> history id, for the histories checked so far; this history
+            is added.
         report: receives the problems.
     """
     entry = history.entry
@@ -68,7 +68,7 @@ def check_history(
             report.add(entry.shard, f"history {entry.history_id}: {fault}")
         arrays = (history.read(name) for name in (record_field(info.kind).name, "actions"))
         digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).digest()
-        other = contents.setdefault((entry.task_id, digest), entry.history_id)
+        other = contents.setdefault(digest, entry.history_id)
         if other != entry.history_id:
             report.add(entry.shard, f"history {entry.history_id}: has the content of history {other}")
         report.transitions += entry.T

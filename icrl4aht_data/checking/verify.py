@@ -152,7 +152,7 @@ def _check_shards(
     local = ReleaseLocation(index.root)  # a local location downloads nothing; missing files are already reported
     members = grouped(index.entries, lambda entry: entry.shard)
     total = sum(len(members[name]) for name in shards)
-    contents: dict[tuple[str, bytes], int] = {}
+    contents: dict[bytes, int] = {}
     for name in shards:
         entries = members[name]
         try:

@@ -17,7 +17,15 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, LABEL_VIEWS, SOURCES, SPLITS, check_family, check_layout_in_split
+from icrl4aht_data.benchmark.facts import (
+    ALL_TRACKS,
+    KIND_FAMILIES,
+    LABEL_VIEWS,
+    SOURCES,
+    SPLITS,
+    check_family,
+    check_layout_in_split,
+)
 from icrl4aht_data.errors import (
     EmptySelectionError,
     Icrl4ahtError,
@@ -27,7 +35,7 @@ from icrl4aht_data.errors import (
     check_choice,
 )
 from icrl4aht_data.format.info import ReleaseInfo, read_info
-from icrl4aht_data.format.layouts_file import PUBLISHED, check_layouts_stored, layout_family, read_layouts
+from icrl4aht_data.format.layouts_file import check_layouts_stored, is_generated, layout_family, read_layouts
 from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, HISTORIES, INFO, KINDS, TEXTS, Entry, as_json, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import Layout, add_layouts, get_layout
@@ -38,6 +46,15 @@ from icrl4aht_data.utils.text import counted_histories, listed_names
 
 QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id", "source", "label_view")
 """Entry fields that histories can be filtered by."""
+
+_KNOWN: dict[str, Iterable[str]] = {
+    "split": SPLITS,
+    "track": ALL_TRACKS,
+    "source": SOURCES,
+    "label_view": LABEL_VIEWS,
+    "teammate_kind": KIND_FAMILIES,
+}
+"""Field -> values that exist in the benchmark, even if no history of a release has them."""
 
 _BLOCK = 2**12  # number of entries in memory at a time
 
@@ -245,9 +262,13 @@ class Index:
 
     def _family_layouts(self, families: Iterable[str]) -> list[str]:
         """Return the layouts of the release that belong to any of the families."""
-        by_family = {PUBLISHED: []} | grouped(self.values("layout"), layout_family)
+        by_family, families = grouped(self.values("layout"), layout_family), list(families)
         for family in families:
-            check_choice(LAYOUT_FAMILY, family, by_family)
+            if family not in by_family:
+                raise EmptySelectionError(
+                    f"{self.root}: no history has {LAYOUT_FAMILY}={family!r}. This release has {LAYOUT_FAMILY} "
+                    f"{listed_names(list(by_family))}"
+                )
         return [layout for family in families for layout in by_family[family]]
 
     def _known_value(self, name: str, value: str, given: str) -> str:
@@ -259,12 +280,12 @@ class Index:
             given: name of the field in messages.
         """
         if name == "layout":
-            return get_layout(str(value)).name
+            # A generated layout is known only once a release with it was opened, which must not change the result.
+            return str(value) if is_generated(str(value)) else get_layout(str(value)).name
         if name == "teammate_family":
             check_family(value)
         else:
-            known = {"split": SPLITS, "track": ALL_TRACKS, "source": SOURCES, "label_view": LABEL_VIEWS}.get(name, ())
-            check_choice(given, value, (*known, *filter(None, self.values(name))))
+            check_choice(given, value, dict.fromkeys((*_KNOWN.get(name, ()), *filter(None, self.values(name)))))
         return value
 
 

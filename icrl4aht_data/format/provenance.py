@@ -242,13 +242,14 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
             return True
         return self.references.oracle >= return_end
 
-    def entry_fields(self, episodes: int) -> dict[str, Any]:
+    def entry_fields(self, episodes: int, has_expert_actions: bool) -> dict[str, Any]:
         """Return the fields of an index entry that describe the history's expert and teammates.
 
         Args:
             episodes: number of episodes of the history.
+            has_expert_actions: whether the history has the expert's actions; otherwise the expert's fields are None.
         """
-        expert = self.expert or ExpertLabels(None, "")
+        expert = (self.expert if has_expert_actions else None) or ExpertLabels(None, "")
         return {
             "expert_return": expert.return_greedy,
             "expert_return_sampled": expert.return_sampled,

@@ -229,10 +229,13 @@ def check_labels(dataset: Selection, labels: Labels) -> None:
     missing = np.flatnonzero(~has[labels])
     counts = ", ".join(f"{int(has[name].sum())} have {name} actions" for name in LABELS)
     tasks = dataset.column("task_id")[missing]
+    advice = f"use labels that all histories have, or ds.select(ds.has_labels({labels!r}))"
+    if not any(found.any() for found in has.values()):
+        advice = "AD can learn the histories' own actions (labels=None); for labels, choose another release"
     raise LabelsMissingError(
-        f"labels = {labels}: {len(missing)} of {len(dataset)} histories have no {labels} actions, in "
-        f"{counted_noun(len(np.unique(tasks)), 'task')} (first: history {dataset.ids[missing[0]]} of task {tasks[0]}); "
-        f"{counts}: use labels that all histories have, or ds.select(ds.has_labels({labels!r}))"
+        f"{dataset.index.root}: labels = {labels}: {len(missing)} of {len(dataset)} histories have no {labels} "
+        f"actions, in {counted_noun(len(np.unique(tasks)), 'task')} (first: history {dataset.ids[missing[0]]} of task "
+        f"{tasks[0]}); {counts}: {advice}"
     )
 
 
@@ -248,11 +251,13 @@ def _warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
     names = [values[code] for code in codes.tolist()]
     if labels == "expert":
         earned = dataset.column("expert_return")[first]
-        advice = "leave these tasks out by min_expert_return, or select by ds.column('expert_return')"
+        advice = "leave them out by min_expert_return, or, if some returns are unknown, ds.select(~(ds.column("
+        advice += "'expert_return') < LEAST))"
     else:
-        references = [dataset.provenance.of(name).references for name in names]
-        earned = np.array([np.nan if one is None else one.oracle for one in references])
-        advice = "leave these tasks out"
+        # The reference is the return with the task's first teammate, so it is no measure if teammates change.
+        made = [dataset.provenance.of(name) for name in names]
+        earned = np.array([np.nan if one.references is None or one.swaps else one.references.oracle for one in made])
+        advice = "leave them out by ds.select(~np.isin(ds.column('task_id'), NAMES))"
     weak = np.flatnonzero(are_labels_weak(earned, ends))
     if not len(weak):
         return

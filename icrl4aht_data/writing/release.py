@@ -282,7 +282,7 @@ class _ShardWriter:
             learner=history.learner,
             has_oracle_actions="oracle_actions" in arrays,
             **curve_fields(returns),
-            **new.provenance.entry_fields(len(returns)),
+            **new.provenance.entry_fields(len(returns), "expert_actions" in arrays),
         )
 
     def _with_positions(self, entries: list[Entry], shard: str) -> list[Entry]:

@@ -75,9 +75,9 @@ def test_proof_has_an_entry_for_each_training_run_and_keeps_comparable_ones(rele
     assert " | ".join(["| all | AD | expert", *spreads]) in proof_table(json.loads(path.read_text()))
 
     content = json.loads(path.read_text())
-    content["runs"][0]["histories_sha256"] = "0"
+    content["runs"][0]["settings_sha256"] = "0"
     path.write_text(json.dumps(content))
-    assert len(written(own)) == 2, "an entry of other histories is removed"
+    assert len(written(own)) == 2, "an entry of other histories or settings is removed"
     changed = finish(replace(own, options=replace(options, steps=3)), 0.0)
     assert len(written(changed)) == 1, "the settings of the earlier runs differ"
 

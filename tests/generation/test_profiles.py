@@ -242,7 +242,9 @@ def test_validation_teammate_that_is_also_a_training_teammate_raises_error(chang
     monkeypatch.setattr(profile_module, "spread_teammates", lambda layout, split, count: [entry] * count)
     counts = "per_layout = 0\nvalidation = { coord_simple = 1 }"
     spread_profile(changed, 'presets = ["default"]', counts)
-    with pytest.raises(OptionError, match="1 of the validation tasks have a teammate of a training task, such as team"):
+    with pytest.raises(
+        OptionError, match=r"1 of 1 validation tasks have a teammate that acts like a training .*, such as team"
+    ):
         spread_profile(changed, PRESETS, counts)
 
 
@@ -312,7 +314,7 @@ H3 = 'families = ["assembly_line"]'
         ("[release]", "[teammates]\nmembers = 2\ntrain = 40\n[release]", "train = 40, .* at most 10 together"),
         ('"coord_simple"', '"asymm_right"', "train split of track layout 'asymm_right'; valid: asymm_both"),
         ("presets =", 'sources = ["agent"]\npresets =', "agent"),
-        ("presets =", 'sources = ["search"]\npreference = ["demo_wide"]\npresets =', "demo_wide"),
+        ("presets =", 'sources = ["ppo", "search"]\npreference = ["demo_wide"]\npresets =', "demo_wide"),
         ("[ego]", "[ego", r"Expected '\]' at the end of a table declaration \(at line 2"),
     ],
 )
@@ -322,9 +324,50 @@ def test_invalid_profile_raises_error_with_its_name(changed, old, new, named):
         load_profile(path)
 
 
+@pytest.mark.parametrize(
+    ("own", "named"),
+    [
+        (
+            'base = "noise"\n[tasks.sampled]\nvalidation = 4',
+            r"4 drawn validation .*there are only 1 .*the 3 behaviours",
+        ),
+        ('base = "search"\n[tasks]\nlayouts = ["demo_wide"]', r"\['search'\] with 1 layouts .*preference only"),
+        ('base = "bundle"\n[noise.layouts]\ndemo_wide = 3', r"noise.layouts.demo_wide = 3: expected a table"),
+        ('base = "bundle"\n[ego]\nlayouts = 3', r"ego.layouts = 3: expected a table"),
+        (
+            'base = "bundle"\n[[tasks.generated]]\nfamily = "rooms"\ncount = 2',
+            "2 of 2 layouts .*rooms-0-0: expected teammates",
+        ),
+        ('base = "bundle"\n[tasks.spread]\nper_layout = -1', r"tasks.spread.per_layout`, found -1"),
+        ('base = "bundle"\n[tasks.spread]\nper_layout = { demo_wide = -1 }', r"per_layout\[...\]`"),
+        ('base = "bundle"\n[tasks]\nlayout = ["demo_wide"]', r"'tasks.layout'; valid: .* Did you mean 'tasks.layouts'"),
+        ('base = "bundle"\n[[tasks.generated]]\nmates = 2', r"'tasks.generated.mates'; valid: tasks.generated.family"),
+        ("", "missing required field `release`"),
+    ],
+)
+def test_profile_that_extends_another_names_wrong_values(tmp_path, own, named):
+    path = tmp_path / "mine.toml"
+    path.write_text(own)
+    with pytest.raises(OptionError, match=rf"(?s)mine.toml: .*{named}"):
+        load_profile(str(path))
+
+
+def test_extended_profile_can_leave_layouts_and_sources_out(tmp_path):
+    """Values of the base for layouts that the profile leaves out have no effect."""
+    path = tmp_path / "mine.toml"
+    path.write_text('base = "bundle"\n[tasks]\nlayouts = ["demo_wide"]\nsources = ["noise"]\npreference = []\n')
+    mine, base = load_profile(str(path)), load_profile("bundle")
+    noise = [work.task for work in base.units() if work.source == "noise"]
+    kept = [task.task_id for task in noise if task.layout.name in mine.layouts]
+    assert [work.task.task_id for work in mine.units()] == kept
+    assert mine.layouts == ("demo_wide", *base.generated)
+
+
 def test_unknown_profile_name_raises_error():
     with pytest.raises(UnknownNameError, match=r"unknown profile 'smoek'; valid: .*Did you mean 'smoke'"):
         load_profile("smoek")
+    with pytest.raises(UnknownNameError, match=r"nothere.toml: no such file; expected a TOML file or one of billion"):
+        load_profile("nothere.toml")
 
 
 def test_task_id_depends_on_every_field_of_the_task():

@@ -60,6 +60,7 @@ train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.
 train ad --layout demo_wide --process 1 | expected --coordinator HOST:PORT as well
 train rl2 --layout demo_wide --size tiny | --size: cannot be used with rl2, which learns by playing
 train rl2 --layout all --next-obs --context 5 | --context, --next-obs: cannot be used with rl2, which learns by playing
+train hybrid_ad --layout all --heads 2 | --heads: cannot be used with hybrid_ad, which does not have these options
 train ad --layout demo_wide --epochs 2 | --epochs: cannot be used with ad, only with rl2, which learns by playing
 research reference --name rl2-reference --no-evaluate --bundle-as rl2-x | because the card states its results
 research reference --name rl2-reference --track preference | no model of this track exists for rl2-reference
@@ -77,6 +78,7 @@ train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 """
 
 FAILED = """
+train rl2 --layout all --balance | balance = True: rl2 learns by playing, not from histories; leave out this option
 list none | none: no release here, expected the file meta/info.json; give the folder of a release
 list empty | empty: no release here, expected the file meta/info.json; give the folder of a release
 verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked

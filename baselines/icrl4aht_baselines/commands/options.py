@@ -11,7 +11,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_BY_RL2, ModelOptions
+from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED, ModelOptions
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task
@@ -187,7 +187,7 @@ def prepare_training(
     from icrl4aht_baselines.training.histories import prepare
 
     if method in PLAYING:
-        if unused := {"size"} if size else UNUSED_BY_RL2 & (train.keys() | model.keys()):
+        if unused := {"size"} if size else UNUSED[method] & (train.keys() | model.keys()):
             raise click.UsageError(f"{_flags(unused)}: cannot be used with {method}, which learns by playing")
         sized = ModelOptions(**RL2_SETTINGS["model"] | model)
         options = TrainOptions(**RL2_SETTINGS["train"] | train)
@@ -203,6 +203,8 @@ def prepare_training(
         return job, text
     if given := {*play, *(["manifest"] if manifests else [])}:
         raise click.UsageError(f"{_flags(given)}: cannot be used with {method}, only with rl2, which learns by playing")
+    if unused := UNUSED.get(method, set()) & model.keys():  # ignored options would be stored and printed
+        raise click.UsageError(f"{_flags(unused)}: cannot be used with {method}, which does not have these options")
     on_cpu = jax.default_backend() == "cpu"
     name = size or ("tiny" if on_cpu else "small")
     sized = ModelOptions(**SIZES[name].model | model)
@@ -211,9 +213,12 @@ def prepare_training(
     options = TrainOptions(**SIZES[name].train | {"batch_size": batch_size} | train)
     job = prepare(method, sized, options, histories)
     reason = "" if size else f", the default {'on a CPU' if on_cpu else 'on this device'}"
+    trunk = f"layers {sized.layers}, positions {sized.positions}"
+    if method == "hybrid_ad":
+        trunk = f"GRU layers {sized.recurrent_layers}"
     text = (
-        f"size {name}{reason}: layers {sized.layers}, width {sized.width}, encoder {sized.encoder}, positions "
-        f"{sized.positions}, K = {options.context}, steps {options.steps}, batch size {options.batch_size}\n"
+        f"size {name}{reason}: {trunk}, width {sized.width}, encoder {sized.encoder}, K = {options.context}, steps "
+        f"{options.steps}, batch size {options.batch_size}\n"
         f"{training_summary(job.about['histories'])}"
     )
     return job, text

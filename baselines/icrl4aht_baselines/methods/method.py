@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, Num
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.tokens import BatchView, StepInput, Tokenizer
 from icrl4aht_baselines.methods.transformer import Transformer
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import ACTIONS
 
 Loss = Callable[[Any, Any, Any, Any], tuple[Array, dict[str, Array]]]
@@ -102,7 +103,13 @@ def compute_dtype(options: ModelOptions) -> Any:
 
 
 def make_transformer(options: ModelOptions) -> Transformer:
-    """Return a transformer with the architecture of the options."""
+    """Return a transformer with the architecture of the options.
+
+    Raises:
+        OptionError: if the width is not a multiple of twice the number of heads.
+    """
+    if options.width % (2 * options.heads):
+        raise OptionError(f"width = {options.width}: expected a multiple of twice the heads ({2 * options.heads})")
     return Transformer(options.layers, options.width, options.heads, options.dropout, options.positions, options.remat)
 
 

@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal, NamedTuple
 from icrl4aht_generation.learners.config import EncoderKind
 from msgspec import Meta
 
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.options import Count, Option, Positive, ShareBelowOne, check_options
 
 Positions = Literal["none", "rope"]
@@ -66,7 +65,7 @@ class ModelOptions:
     """Architecture of a model; the defaults are the paper's (App. E.5).
 
     Raises:
-        OptionError: if a value is out of bounds, or the width is not a multiple of twice the number of heads.
+        OptionError: if a value is out of bounds.
     """
 
     layers: Annotated[Count, Option("Layers of the transformer.")] = 4
@@ -94,12 +93,18 @@ class ModelOptions:
 
     def __post_init__(self) -> None:
         check_options(self)
-        if self.width % (2 * self.heads):
-            raise OptionError(f"width = {self.width}: expected a multiple of twice the heads ({2 * self.heads})")
 
 
-UNUSED_BY_RL2 = {
-    *("layers", "heads", "positions", "remat", "discounts", "dropout", "next_obs", "label_smoothing", "bfloat16"),
-    *("context", "accumulate", "weight_decay", "validate_every", "validation_batches"),
+_TRANSFORMER = {"layers", "heads", "positions", "remat"}
+
+UNUSED = {
+    "ad": {"recurrent_layers", "discounts"},
+    "dpt": {"recurrent_layers", "discounts"},
+    "hybrid_ad": {*_TRANSFORMER, "discounts"},
+    "amago_offline": {"recurrent_layers"},
+    "rl2": {
+        *(*_TRANSFORMER, "discounts", "dropout", "next_obs", "label_smoothing", "bfloat16"),
+        *("context", "accumulate", "weight_decay", "validate_every", "validation_batches"),
+    },
 }
-"""Names of the options of models and training that RL^2 does not use."""
+"""Name of a method -> names of the options of models and training that it does not use."""

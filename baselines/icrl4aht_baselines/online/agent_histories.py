@@ -32,7 +32,7 @@ from icrl4aht_generation.policy import Policy, randomize_action
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from jaxtyping import Array, Float, Int, Int8
 
-from icrl4aht_baselines.agents.egos import NamedEgo
+from icrl4aht_baselines.agents.egos import SCRIPTED, NamedEgo
 from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import get_protocol, segment_lengths
 from icrl4aht_baselines.evaluate.rollout import ProgramCache
@@ -330,8 +330,12 @@ def collect_release(
     show, label = bar_updater(progress, f"{agent.name}: episodes", total), labeller and labeller.make
     by = f"{agent.name}, before the noise" if labeller is None else f"{labeller.name}, in histories of {agent.name}"
     new = []
-    for (layout, kind), tasks in grouped(teammates.tasks, lambda task: (task.layout.name, task.teammate_kind)).items():
-        folder = parts / f"{layout}-{kind}"
+    # A script reads the dish from the recipes of its layout, so the tasks of a group must have the same recipes.
+    scripted = any(one.make in SCRIPTED for one in (agent, labeller) if one)
+    for group, tasks in grouped(
+        teammates.tasks, lambda task: (task.layout.name, task.teammate_kind, task.layout.recipes if scripted else ())
+    ).items():
+        folder = parts / "-".join([*group[:2], *("".join(map(str, recipe)) for recipe in group[2])])
         if folder.is_dir():
             show(len(tasks) * config.histories * config.episodes)
         else:

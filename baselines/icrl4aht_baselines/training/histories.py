@@ -223,7 +223,7 @@ def _sampler(
         "seed": options.seed,
         "teammate_actions": model.teammate_actions,
         "labels": labels,
-        "episodes": (0, first) if histories.first else None,
+        "episodes": (0, histories.first) if histories.first else None,
         "process_index": jax.process_index(),
         "process_count": jax.process_count(),
     }
@@ -335,6 +335,10 @@ class TrainedModel(NamedTuple):
     hide_recipe: tuple[str, ...] = ()
 
 
+_MEANINGS = {"heads", "positions", "reward_scale", "discounts", "channels"}
+"""Options that change what parameters do, but not their shapes."""
+
+
 def load_initial_params(run: Path, method: Method, about: dict[str, Any]) -> Any:
     """Return an old run's parameters as the start of a new run, and add the old run to the new run's settings.
 
@@ -348,12 +352,14 @@ def load_initial_params(run: Path, method: Method, about: dict[str, Any]) -> Any
     """
     before, config = read_trained(run), read_config(run)
     shapes = jax.eval_shape(method.init, jax.random.key(0))
-    if jax.tree.map(jnp.shape, before.params) != jax.tree.map(jnp.shape, shapes):
-        found, expected = (
-            {"method": name, "obs_shape": list(one["histories"]["obs_shape"]), **asdict(ModelOptions()), **one["model"]}
-            for name, one in ((config["method"], config), (method.name, about))
-        )
-        listed = "; ".join(f"{k} = {a!r}, not {b!r}" for k, (a, b) in differing_settings(found, expected).items())
+    found, expected = (
+        {"method": name, **asdict(ModelOptions()), **one["model"]}
+        | {field: one["histories"][field] for field in ("obs_shape", "channels")}
+        for name, one in ((config["method"], config), (method.name, about))
+    )
+    differ = differing_settings(found, expected)
+    if jax.tree.map(jnp.shape, before.params) != jax.tree.map(jnp.shape, shapes) or differ.keys() & _MEANINGS:
+        listed = "; ".join(f"{k} = {a!r}, not {b!r}" for k, (a, b) in differ.items())
         raise OptionError(f"{run}: trained with other options ({listed}); give these options, or another run")
     about["init"] = {"run": before.hash, "step": before.step}
     about[TRAINED_ON] = [*about[TRAINED_ON], *(cell for cell in before.trained_on if cell not in about[TRAINED_ON])]

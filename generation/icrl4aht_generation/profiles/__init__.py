@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,7 @@ from msgspec import Meta, Struct
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS, PREFERENCE_LAYOUTS, REBUILT_SOURCES
 from icrl4aht_data.benchmark.tasks import teammate_id
-from icrl4aht_data.errors import OptionError, check_choice, unknown_name
+from icrl4aht_data.errors import OptionError, UnknownNameError, check_choice, unknown_name
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.overcooked.layouts import add_layouts, get_layout
 from icrl4aht_data.utils.options import Count, Natural, replace_options
@@ -20,6 +21,7 @@ from icrl4aht_generation.layouts.families import generate_layouts
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.profiles.profile import Profile, SampledConfig, SpreadConfig, TeammateConfig, WorkUnit
+from icrl4aht_generation.teammates.draws import find_draw
 
 FOLDER = Path(__file__).parent
 
@@ -95,6 +97,17 @@ class _ProfileFile(Struct, forbid_unknown_fields=True):
     xla_threads: Count | None = None
 
 
+_SECTIONS = {
+    "": _ProfileFile,
+    "release": _Release,
+    "tasks": _Tasks,
+    "tasks.generated": _Generated,
+    "tasks.sampled": _SampledTasks,
+    "tasks.spread": _Spread,
+}
+"""Name of a section of a profile -> class of its fields, for sections with fixed fields."""
+
+
 def profile_names() -> list[str]:
     """Return the names of the shipped profiles."""
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
@@ -113,17 +126,28 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
     """
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.is_file():
+        if name.endswith(".toml"):
+            raise UnknownNameError(f"{name}: no such file; expected a TOML file or one of {', '.join(profile_names())}")
         raise unknown_name("profile", name, profile_names())
     with _errors_with_path(path):
-        profile = _build_profile(path.stem, msgspec.convert(_read_content(path), _ProfileFile))
+        profile = _build_profile(path.stem, _convert(_read_content(path)))
     prepare(profile)
     with _errors_with_path(path):
         units = profile.units()  # raises an error for unknown presets or too many sampled teammates
         if not units and not profile.algorithms:
             raise OptionError(
-                "no tasks: expected teammates in tasks.presets, tasks.sampled, tasks.spread or tasks.algorithms"
+                "no tasks: expected teammates in tasks.presets, tasks.sampled, tasks.spread, tasks.algorithms or "
+                "tasks.generated"
             )
-        _check_splits(units, profile.sampled, profile.spread)
+        played = {work.task.layout.name for work in units}
+        alone = [name for name in profile.generated if name not in {*played, *profile.algorithms}]
+        if alone:
+            raise OptionError(
+                f"tasks.generated: {len(alone)} of {len(profile.generated)} layouts have no teammate, such as "
+                f"{alone[0]}: expected teammates = 1 or more in its table"
+            )
+        _check_sections(profile.sampled, profile.spread)
+        check_splits(units)
     return profile
 
 
@@ -134,7 +158,48 @@ def _read_content(path: Path) -> dict[str, Any]:
     if base is None:
         return content
     check_choice("base", base, profile_names())
-    return _merge_tables(_read_content(FOLDER / f"{base}.toml"), content)
+    inherited = _read_content(FOLDER / f"{base}.toml")
+    merged = _merge_tables(inherited, content)
+    # The base's values for layouts that the file leaves out would be errors in the file, which does not have them.
+    return _merge_tables(_without_keys(inherited, _chosen_layouts(inherited) - _chosen_layouts(merged)), content)
+
+
+def _chosen_layouts(content: Mapping[str, Any]) -> set[str]:
+    """Return the names in tasks.layouts and tasks.preference; empty if a value is malformed."""
+    try:
+        found = msgspec.convert(content, _ProfileFile).tasks
+    except msgspec.ValidationError:
+        return set()
+    return {*found.layouts, *(PREFERENCE_LAYOUTS["train"] if found.preference == ("all",) else found.preference)}
+
+
+def _without_keys(table: Mapping[str, Any], keys: set[str]) -> dict[str, Any]:
+    """Return nested tables without some keys."""
+    kept = {key: value for key, value in table.items() if key not in keys}
+    return {key: _without_keys(value, keys) if isinstance(value, dict) else value for key, value in kept.items()}
+
+
+def _convert(content: dict[str, Any]) -> _ProfileFile:
+    """Check the structure of a profile.
+
+    Raises:
+        OptionError: if it is wrong; the message states the value that was found, or the valid keys.
+    """
+    try:
+        return msgspec.convert(content, _ProfileFile)
+    except msgspec.ValidationError as error:
+        place = re.search(r" - at `\$(.*)`", str(error))
+        keys = re.findall(r"\.(\w+)|\[(\d+)\]", place[1]) if place and "[...]" not in place[1] else []
+        found: Any = content
+        for name, number in keys:
+            found = found[name or int(number)]
+        unknown = re.search("unknown field `(.*?)`", str(error))
+        section = ".".join(name for name, _ in keys if name)
+        if unknown:
+            known = [field.encode_name for field in msgspec.structs.fields(_SECTIONS[section])]
+            prefix = section and section + "."
+            raise unknown_name("key", prefix + unknown[1], [prefix + one for one in known]) from error
+        raise OptionError(f"{error}, found {found!r:.100}" if keys else str(error)) from error
 
 
 def _merge_tables(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
@@ -164,6 +229,12 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
         generated |= dict.fromkeys(names[len(generated) :], one.teammates)
     layouts += tuple(generated)
     _check_known("source", "tasks.sources", sources, REBUILT_SOURCES)
+    if sources == ("search",) and (layouts or tasks.sampled or tasks.spread or tasks.algorithms):
+        raise OptionError(
+            f"tasks.sources = ['search'] with {len(layouts)} layouts in tasks.layouts and tasks.generated: search "
+            f"plays the layouts in tasks.preference only; add another source, or remove tasks.layouts, "
+            f"tasks.generated, tasks.sampled, tasks.spread and tasks.algorithms"
+        )
     if not layouts and sources != ("search",):
         raise OptionError("tasks.layouts: expected layouts, found none; name layouts, or add tasks.generated")
     preference = PREFERENCE_LAYOUTS["train"] if tasks.preference == ("all",) else tasks.preference
@@ -208,7 +279,11 @@ def _read_section(
 ) -> tuple[Config, dict[str, Config]]:
     """Return the settings of a section, and the settings of each layout in the section's table `layouts`."""
     common = replace_options(default, {key: value for key, value in values.items() if key != "layouts"}, f"{name}.")
-    own = _by_layout(f"{name}.layouts", values.get("layouts", {}), layouts)
+    tables = values.get("layouts", {})
+    for key, table in {"": tables, **(tables if isinstance(tables, dict) else {})}.items():
+        if not isinstance(table, dict):
+            raise OptionError(f"{name}.layouts{key and '.' + key} = {table!r}: expected a table")
+    own: dict[str, Any] = _by_layout(f"{name}.layouts", tables, layouts)
     return common, {each: replace_options(common, of, f"{name}.layouts.{each}.") for each, of in own.items()}
 
 
@@ -246,12 +321,8 @@ def _teammate_counts(
     return counts
 
 
-def _check_splits(units: Sequence[WorkUnit], sampled: SampledConfig | None, spread: SpreadConfig | None) -> None:
-    """Check that no teammate of a layout is both in the training and in the validation split.
-
-    Raises:
-        OptionError: if a teammate is in both splits, or a layout has both sampled and spread teammates.
-    """
+def _check_sections(sampled: SampledConfig | None, spread: SpreadConfig | None) -> None:
+    """Check that no layout has both sampled and spread teammates."""
     for name in spread.per_layout if spread and sampled else ():
         both = [config.per_layout[name] + config.validation[name] for config in (sampled, spread) if config]
         if all(both):
@@ -259,18 +330,30 @@ def _check_splits(units: Sequence[WorkUnit], sampled: SampledConfig | None, spre
                 f"{name}: {both[0]} teammates of tasks.sampled and {both[1]} of tasks.spread: validation teammates of "
                 f"one section may resemble training teammates of the other; use only one section for a layout"
             )
+
+
+def check_splits(units: Sequence[WorkUnit]) -> None:
+    """Check that no teammate of a layout's validation split acts like a teammate of its training split.
+
+    Raises:
+        OptionError: if a behaviour is in both splits; the message states the number of such validation tasks.
+    """
     trained = {_teammate_key(work) for work in units if work.task.split == "train"}
-    shared = {work.task.task_id for work in units if work.task.split == "validation" and _teammate_key(work) in trained}
+    checked = {work.task.task_id: _teammate_key(work) for work in units if work.task.split == "validation"}
+    shared = [task for task, key in checked.items() if key in trained]
     if shared:
         raise OptionError(
-            f"{len(shared)} of the validation tasks have a teammate of a training task, such as {min(shared)}: remove "
-            f"the teammate from tasks.presets, or request fewer validation teammates"
+            f"{len(shared)} of {len(checked)} validation tasks have a teammate that acts like a training teammate, "
+            f"such as {min(shared)}: remove such teammates from the given tasks, or from tasks.presets in a profile"
         )
 
 
 def _teammate_key(work: WorkUnit) -> tuple[Any, ...]:
-    """Return a key that is equal for units with the same teammate, layout and recipes."""
-    return work.task.layout.name, work.task.recipes, teammate_id(work.task.teammate)
+    """Return a key that is equal for units on one layout with the same recipes whose teammates act alike."""
+    layout, teammate = work.task.layout.name, work.task.teammate
+    draw = find_draw(layout, teammate) if "theta_id" in teammate else None
+    acts: tuple[Any, ...] = (teammate_id(teammate),) if draw is None else (draw.family, draw.behaviour)
+    return layout, work.task.recipes, acts
 
 
 def _teammate_config(values: dict[str, Any]) -> TeammateConfig:

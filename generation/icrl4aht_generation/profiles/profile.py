@@ -135,8 +135,11 @@ class SampledConfig(SpreadConfig):
     families: dict[str, tuple[str, ...]]
 
     def _split_entries(self, layout: str, split: str, count: int) -> list[dict[str, Any]]:
-        seed = VALIDATION_SEED if split == "validation" else 0
-        return [entry for entry, _ in drawn_teammates(layout, self.families[layout], count, seed)]
+        families, seed, trained = self.families[layout], 0, set[tuple[str, int]]()
+        if split == "validation" and count:
+            training = drawn_teammates(layout, families, self.per_layout[layout])
+            trained, seed = {(draw.family, draw.behaviour) for _, draw in training}, VALIDATION_SEED
+        return [entry for entry, _ in drawn_teammates(layout, families, count, seed, trained)]
 
 
 @dataclass(frozen=True)

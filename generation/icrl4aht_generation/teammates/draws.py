@@ -12,7 +12,7 @@ Diverse draws must have a larger distance to every test instance.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -142,7 +142,11 @@ def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
 
 
 def drawn_teammates(
-    layout: str, families: Sequence[str], count: int, base_seed: int = 0
+    layout: str,
+    families: Sequence[str],
+    count: int,
+    base_seed: int = 0,
+    without: Collection[tuple[str, int]] = (),
 ) -> list[tuple[dict[str, Any], Draw]]:
     """Choose sampled teammates of a layout from the table, without simulation.
 
@@ -155,6 +159,7 @@ def drawn_teammates(
         families: kinds of heuristics, in the order of their turns.
         count: number of teammates.
         base_seed: seed of the draws, see `DRAWS_PER_SEED`.
+        without: pairs (family, behaviour) that must not be chosen, such as those of training teammates.
 
     Returns:
         Teammate entries, as `sample_teammate` returns them, with their draws.
@@ -165,11 +170,13 @@ def drawn_teammates(
     """
     name = get_layout(layout).name
     queues = [_ordered_draws(name, family, base_seed) for family in dict.fromkeys(families)]
+    queues = [[draw for draw in queue if (draw.family, draw.behaviour) not in without] for queue in queues]
     available = sum(map(len, queues))
     if count > available:
+        unlike = f" that act unlike the {len(without)} behaviours of the training teammates" if without else ""
         raise OptionError(
             f"{name}: {count} {_OF_SEED[base_seed]} teammates requested from {', '.join(families) or 'no family'}, "
-            f"but there are only {available} distinct draws; request fewer, or name more families "
+            f"but there are only {available} distinct draws{unlike}; request fewer, or name more families "
             f"({_usable_text(name, base_seed)})"
         )
     turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]

@@ -127,6 +127,8 @@ def test_training_rejects_initial_parameters_of_another_model_size(trained_run, 
     small = ["--steps", "1", "--batch-size", "2", "--context", "6", "--heads", "2", "--dropout", "0.1"]
     with pytest.raises(OptionError, match=r"trained with other options \(width = 8, not 12\); give these"):
         run_cli(*arguments, *small, "--layers", "1", "--width", "12", "--positions", "none")
+    with pytest.raises(OptionError, match=r"trained with other options \(.*positions = 'none', not 'rope'"):
+        run_cli(*arguments, *small, "--layers", "1", "--width", "8", "--positions", "rope")
     assert not Path(out).exists()
 
 

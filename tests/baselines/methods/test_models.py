@@ -48,7 +48,8 @@ class TestModelOptions:
 
     def test_invalid_model_options_raise_errors(self):
         with pytest.raises(OptionError, match="width = 30: expected a multiple of twice the heads"):
-            ModelOptions(width=30)
+            get_method("ad")(ModelOptions(width=30), overcooked_world([get_layout("coord_simple")]))
+        get_method("hybrid_ad")(ModelOptions(width=30), overcooked_world([get_layout("coord_simple")]))
         with pytest.raises(OptionError, match="dropout = 1"):
             ModelOptions(dropout=1.0)
         with pytest.raises(UnknownNameError, match=r"unknown positions 'rop'.*Did you mean 'rope'"):

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, stay
+from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, find_agent, stay
 from icrl4aht_baselines.online import agent_histories
 from icrl4aht_baselines.online.agent_histories import Teammates, collect_release, release_teammates
 from icrl4aht_generation.policy import Policy
@@ -64,6 +64,22 @@ def test_collected_release_passes_deep_verification(release):
     report = verify_release(release, level="deep")
     assert report.ok, report.findings
     assert not list(release.parent.glob("*.parts"))
+
+
+@pytest.mark.parametrize(("agent", "dishes"), [("oracle", 1), ("rl2-adapting", 2)])
+def test_oracle_reads_the_dish_of_every_task(tmp_path, monkeypatch, agent, dishes):
+    """The oracle takes its recipes from one layout, so each of its groups of tasks has one dish."""
+    tasks = read_tasks(manifest_path("preference", "train"))
+    two = [one for one in tasks if (one.layout.name, one.teammate_kind) == ("rooms-0-67", "territory")][:2]
+    assert len({one.layout.recipes for one in two}) == 2
+
+    def record_nothing(make: Any, group: list[Any], *options: Any) -> Any:
+        assert len({one.layout.recipes for one in group}) == dishes
+        raise StopIteration
+
+    monkeypatch.setattr(agent_histories, "record_histories", record_nothing)
+    with pytest.raises(StopIteration):
+        collect_release(find_agent(agent), Teammates(two, {}, tmp_path, tmp_path), CONFIG, tmp_path / "release")
 
 
 def test_provenance_names_the_agent_and_tasks_without_oracle_labels(release, dataset, teammates):

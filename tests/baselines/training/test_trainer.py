@@ -321,6 +321,13 @@ class TestHeldOut:
         dpt = training_job(two_sources[0], "dpt", context=40, queries=3)
         assert dpt.data.train[0].query_target.shape == (OPTIONS.batch_size, 3)
 
+    def test_first_counts_the_episodes_of_each_history(self):
+        """Histories of demo_wide have different lengths, and shorter ones do not limit longer ones."""
+        sampler = training_job(None, layout="demo_wide", first=30).data.train
+        assert len({*sampler.dataset.column("episodes").tolist()} - {*range(30)}) > 1
+        assert min(sampler.dataset.column("episodes")) < 30
+        assert sampler.options()["episodes"] == [0, 30]
+
     def test_balance_gives_all_sources_the_same_probability(self):
         sampler = training_job(None, layout="demo_wide", balance=True).data.train
         sources, weights = sampler.dataset.column("source"), np.array(sampler.options()["weights"])
@@ -355,7 +362,7 @@ class TestHeldOut:
             (
                 {"algorithm": ("fpc",)},
                 UnknownNameError,
-                r"unknown algorithm 'fpc'; valid: assembly_line, .*Did you mean 'fcp'",
+                r"unknown algorithm 'fpc'; valid: fcp, .*Did you mean 'fcp'",
             ),
             ({"source": ("ppo", "dqn")}, UnknownNameError, "unknown source 'dqn'; valid: ppo, noise"),
             (
@@ -389,7 +396,7 @@ class TestHeldOut:
 
     def test_dpt_training_without_labels_raises_error(self, tmp_path):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
-        with pytest.raises(LabelsMissingError, match=r"have no expert actions.*: use labels that all histories have"):
+        with pytest.raises(LabelsMissingError, match=r"/r: .*no expert actions.*: AD can learn the histories' own"):
             training_job(tmp_path / "r", "dpt")
 
 

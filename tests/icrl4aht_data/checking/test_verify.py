@@ -166,12 +166,16 @@ def test_deep_verification_finds_observations_that_differ_from_the_state(tmp_pat
     assert found.endswith("obs: 1 steps differ from what their state shows, first step 17")
 
 
-def test_verify_finds_equal_histories_in_different_shards(tmp_path):
-    (task,) = make_tasks(["demo_simple"])
-    arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
-    new = NewTask(task, Provenance(), 2, lambda: [NewHistory(0, arrays), NewHistory(1, arrays)])
-    write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20, shard_histories=1)
-    assert any("history 1: has the content of history 0" in problem for problem in problems(tmp_path / "r"))
+def test_verify_finds_equal_histories_in_different_shards_and_tasks(tmp_path):
+    tasks = make_tasks(["demo_simple"], teammates=2)
+    arrays = random_history(tasks[0].layout, 6, 20, np.random.default_rng(5))
+    new = [
+        NewTask(tasks[0], Provenance(), 2, lambda: [NewHistory(0, arrays), NewHistory(1, arrays)]),
+        NewTask(tasks[1], Provenance(), 1, lambda: [NewHistory(0, arrays)]),
+    ]
+    write_release(tmp_path / "r", "lite", new, data_version="0.0.1", card="", kept_steps=20, shard_histories=1)
+    for copy in (1, 2):
+        assert any(f"history {copy}: has the content of history 0" in problem for problem in problems(tmp_path / "r"))
 
 
 def test_verify_finds_the_chunk_table_of_another_shard(release_copy):
@@ -293,9 +297,14 @@ class TestVerifyCommand:
 @pytest.mark.parametrize("split", ["test", "validation"])
 def test_verify_finds_a_training_teammate_in_another_split(tmp_path, split):
     (train,) = make_tasks(["coord_simple"])
-    tasks = [train, make_task("teammate", split, "coord_simple", train.teammate, 9)]
-    arrays = random_history(train.layout, 6, 20, np.random.default_rng(0))
-    new = [NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)]) for task in tasks]
+    copied = train.teammate | {"theta_id": 7}  # another number, but the same parameters
+    tasks = [train, make_task("teammate", split, "coord_simple", copied, 9)]
+    random = np.random.default_rng(0)
+    arrays = [random_history(train.layout, 6, 20, random) for _ in tasks]
+    new = [
+        NewTask(task, Provenance(), 1, lambda own=own: [NewHistory(0, own)])
+        for task, own in zip(tasks, arrays, strict=True)
+    ]
     write_release(tmp_path / "r", "lite", new, data_version="0.0.1", kept_steps=20)
     assert problems(tmp_path / "r") == [
         f"meta/tasks.jsonl: task {tasks[1].task_id!r} ({split}) has the teammate of {train.task_id!r} (train)"

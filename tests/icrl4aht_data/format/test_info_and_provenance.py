@@ -41,10 +41,11 @@ def test_provenance_keeps_expert_fields_and_unknown_fields():
     found = Provenance.from_json(note)
     assert found.to_json() == note
     described = {"expert_return": 0.0, "expert_return_sampled": 16.9, "expert_step": 7}
-    assert found.entry_fields(2) == described | {"label_view": None, "teammate_of_episode": None}
+    assert found.entry_fields(2, True) == described | {"label_view": None, "teammate_of_episode": None}
     old = {"expert": {"policy_sha256": "ab" * 32, "action": "greedy"}}
     assert Provenance.from_json(old).to_json() == old
-    assert set(Provenance.from_json(old).entry_fields(2).values()) == {None}
+    assert set(Provenance.from_json(old).entry_fields(2, True).values()) == {None}
+    assert set(found.entry_fields(2, False).values()) == {None}
 
 
 @pytest.mark.parametrize(

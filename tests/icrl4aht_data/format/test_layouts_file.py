@@ -15,7 +15,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import parse_task, read_tasks, task_fields, write_tasks
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.options import LAYOUT
-from icrl4aht_data.errors import IndexFormatError, OptionError, TaskFormatError, UnknownNameError
+from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import FORMAT_VERSION, LAYOUTS_FILE, TASKS
@@ -91,8 +91,13 @@ class TestReleaseWithLayouts:
         assert set(ds.column("layout")) == {"mine-3-5"} and len(ds) == 2
         assert set(load_icrl4aht(root, layout_family="published").column("layout")) == {"coord_simple"}
         assert len(load_icrl4aht(root, layout_family=["mine", "published"])) == 4
-        with pytest.raises(UnknownNameError, match=r"layout_family 'rooms'; valid: published, mine"):
+        with pytest.raises(EmptySelectionError, match=r"no history has layout_family='rooms'.* published, mine"):
             load_icrl4aht(root, layout_family="rooms")
+
+    def test_layout_and_kind_that_exist_elsewhere_give_an_empty_selection(self, root):
+        for wanted in ({"layout": "rooms-99-7"}, {"teammate_kind": "comedi"}):
+            with pytest.raises(EmptySelectionError, match=r"no history has .*This release has"):
+                load_icrl4aht(root, **wanted)
 
     def test_unpickled_dataset_restores_its_layouts(self, root, monkeypatch):
         sent = pickle.dumps(load_icrl4aht(root))

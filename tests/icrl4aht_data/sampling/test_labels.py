@@ -101,7 +101,7 @@ class TestMissingLabels:
         dataset = load_icrl4aht(lite[0], layout="demo_wide")
         with pytest.raises(
             LabelsMissingError,
-            match=r"^labels = oracle: 6 of 6 histories have no oracle actions, in 2 tasks \(first: history 6 of "
+            match=r": labels = oracle: 6 of 6 histories have no oracle actions, in 2 tasks \(first: history 6 of "
             r"task teammate_\S*\); 6 have expert actions, 0 have oracle actions: use labels that all histories "
             r"have, or ",
         ):
