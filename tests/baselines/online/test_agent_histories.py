@@ -79,7 +79,9 @@ def test_oracle_reads_the_dish_of_every_task(tmp_path, monkeypatch, agent, dishe
 
     monkeypatch.setattr(agent_histories, "record_histories", record_nothing)
     with pytest.raises(StopIteration):
-        collect_release(find_agent(agent), Teammates(two, {}, tmp_path, tmp_path), CONFIG, tmp_path / "release")
+        collect_release(
+            find_agent(agent), Teammates(two, {}, tmp_path, tmp_path / "from"), CONFIG, tmp_path / "release"
+        )
 
 
 def test_provenance_names_the_agent_and_tasks_without_oracle_labels(release, dataset, teammates):
