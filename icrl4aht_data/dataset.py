@@ -375,6 +375,7 @@ class Dataset(Selection):
         length: int,
         every: int = 1,
         labels: Labels | None = None,
+        at_start: float = 0.0,
         families: bool = False,
         **options: Unpack[SamplerOptions],
     ) -> ADSampler:
@@ -385,9 +386,8 @@ class Dataset(Selection):
             WeakLabelsWarning: see `ADSampler`.
         """
         warn_of_mixed_splits(self)
-        return ADSampler(
-            self, batch_size=batch_size, length=length, every=every, labels=labels, families=families, **options
-        )
+        own: Any = {"every": every, "labels": labels, "at_start": at_start, "families": families}
+        return ADSampler(self, batch_size=batch_size, length=length, **own, **options)
 
     def dpt(
         self,

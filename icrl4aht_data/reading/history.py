@@ -26,9 +26,9 @@ state records, which `icrl4aht_data.overcooked.observe` renders as observations.
 
 Labels = Literal["expert", "oracle"]
 LABELS: tuple[Labels, ...] = ("expert", "oracle")
-"""Kinds of labels, the actions that a model learns to predict: "expert" (field `expert_actions`), greedy actions of a
-policy with the return `Entry.expert_return`, or "oracle" (field `oracle_actions`), actions of the scripted oracle,
-which knows the full state."""
+"""Kinds of labels, the actions that a model learns to predict: "expert" (field `expert_actions`), actions of a policy
+without noise (`Entry.expert_return` is its return, where known), or "oracle" (field `oracle_actions`), actions of the
+scripted oracle, which knows the full state."""
 
 
 class History(FieldArrays):

@@ -14,7 +14,7 @@ from icrl4aht_data.reading.sources import ReadRequest
 from icrl4aht_data.sampling.base import A, Sampler, SamplerOptions, batch_repr, check_labels, describe_batch
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.observer import ArraySpec
-from icrl4aht_data.utils.options import check_int
+from icrl4aht_data.utils.options import Share, check_int, check_number
 
 if TYPE_CHECKING:
     import jax  # noqa: F401 - used by a type argument of the base class
@@ -65,8 +65,8 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
     """A sequence of batches for Algorithm Distillation; batch i is a pure function of (selection, options, seed, i).
 
     For each row, a history is drawn uniformly from the selection (or by `weights`), and the first step of a window
-    uniformly from 0..T - L. Windows cross episode boundaries. Rows are padded with zeros at the end if the history, or
-    the part selected by `episodes` or `curriculum`, is shorter than L.
+    uniformly from 0..T - L (or by `at_start`). Windows cross episode boundaries. Rows are padded with zeros at the end
+    if the history, or the part selected by `episodes` or `curriculum`, is shorter than L.
 
     `sampler[i]` does not depend on the process, the number of workers and threads, the cache, or whether the release is
     lite or full. To resume, continue with the next i.
@@ -81,6 +81,8 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
             the previous episode of the window.
         labels: targets are labels of this kind, "expert" or "oracle", instead of the actions taken; see
             `history.LABELS`.
+        at_start: share of the windows that begin at the first step of a history, or of the part selected by `episodes`
+            or `curriculum`, 0..1. A test begins there, but few windows would.
         families: whether batches have the field `families`, from which a model can learn to predict the teammate's
             family.
         seed: seed of the random draws, a non-negative integer below 2**63.
@@ -111,18 +113,20 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         length: int,
         every: int = 1,
         labels: Labels | None = None,
+        at_start: float = 0.0,
         families: bool = False,
         **options: Unpack[SamplerOptions],
     ) -> None:
         super().__init__(dataset, batch_size=batch_size, length=length, **options)
         self.every = check_int("every", every, 1)
-        self.families, self.labels = families, labels
+        self.families, self.labels, self.at_start = families, labels, check_number("at_start", at_start, Share)
         if labels is not None:
             check_labels(dataset, labels)
 
     def options(self) -> dict[str, Any]:
         # Options with default values are left out, so a position stored before an option existed can be resumed.
         chosen = {"every": self.every > 1, "labels": self.labels is not None, "families": self.families}
+        chosen["at_start"] = self.at_start > 0
         return super().options() | {name: getattr(self, name) for name, differs in chosen.items() if differs}
 
     @cached_property
@@ -173,7 +177,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
             episodes = total // steps
             first = scale_to_range(for_episode, np.minimum(episodes, self.every))
             total = -(-(episodes - first) // self.every) * steps
-        start = scale_to_range(for_start, np.maximum(total - self.length, 0) + 1)
+        start = scale_to_range(self._without_share(for_start), np.maximum(total - self.length, 0) + 1)
         valid = np.minimum(total - start, self.length)
         if self.every == 1:
             # A window given by its first row is copied as a block, ten times faster than L single rows.
@@ -185,6 +189,14 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         # At the first step of episode `first`, `prev_*` come from the history's preceding episode, if there is one.
         rows[start == 0, 0] = (low + first * steps - 1)[start == 0]
         return position, rows[:, 1], rows[:, 1:], rows[:, :-1], valid
+
+    def _without_share(self, random: np.ndarray) -> np.ndarray:
+        """Map the lowest numbers below 2**32, a share of `at_start`, to 0, and the others to all numbers."""
+        if not self.at_start:
+            return random
+        lowest, size = np.uint64(self.at_start * 2**32), np.uint64(2**32)
+        above = (random - lowest) * size // max(size - lowest, np.uint64(1))
+        return np.where(random < lowest, np.uint64(0), above)
 
     def batch(self, i: int, out: ADBatch[np.ndarray] | None = None) -> ADBatch[np.ndarray]:
         batch = self._buffer(out)  # first, so that a batch that is too large raises an error at once

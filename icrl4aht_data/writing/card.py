@@ -59,7 +59,7 @@ from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.install_hints import project_url
 from icrl4aht_data.utils.text import card_file, counted_noun, markdown_table
 from icrl4aht_data.writing.proof import proof_table, read_proof
-from icrl4aht_data.writing.splits import played_teammates, read_distances
+from icrl4aht_data.writing.splits import SplitDistance, played_teammates, read_distances
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -183,16 +183,14 @@ def card_facts(root: Path) -> dict[str, Any]:
     ]
     teammates = _teammate_rows(tasks, list(info.layouts))
     titles = {layout: layout_title(layout) for layout in info.layouts}
-    compared = (row for row in teammates if row["matters"] is not None)
-    matters = {
-        title: [row["matters"] for row in own]
-        for title, own in grouped(compared, lambda row: titles[row["layout"]]).items()
-    }
-    headroom = {title: any(found) for title, found in matters.items()}
+    compared = [row for row in teammates if row["matters"] is not None]
+    of_title = grouped(compared, lambda row: titles[row["layout"]])
+    headroom = {title: any(row["matters"] for row in own) for title, own in of_title.items()}
     first = min(entries, key=lambda entry: (entry.split != "train", entry.history_id))
     length = min(500, *(entry.T for entry in entries if (entry.split, entry.layout) == (first.split, first.layout)))
     tested, learning = benchmark_test_layouts(info.layouts), _learning_rows(tasks, titles)
     sources = Counter(entry.source for entry in entries)
+    distances = read_distances(played_teammates(by_id.values(), provenance))
     labelled = {name: sum(e.has(FIELDS[f"{name}_actions"]) for e in entries) for name in ("expert", "oracle")}
     absent = {f"{name}_actions" for name, number in labelled.items() if not number}
     return {
@@ -214,13 +212,14 @@ def card_facts(root: Path) -> dict[str, Any]:
         },
         "swapped": sum(entry.teammate_of_episode is not None for entry in entries),
         "example": {"split": first.split, "layout": first.layout, "length": length},
-        "layouts": _layout_rows(info, titles, matters),
+        "layouts": _layout_rows(info, titles, teammates, distances),
+        "compared": [row["matters"] for row in compared],
         "learning": learning,
         "curves": _curve_rows(learning, sources),
         "teammates": teammates,
-        "teammate_kinds": _kind_rows(tasks, info.layouts),
+        "teammate_kinds": _kind_rows(tasks),
         **_behaviour_counts(teammates),
-        "split_distances": read_distances(played_teammates(by_id.values(), provenance)),
+        "split_distances": distances,
         "weak": Counter((titles[task.first.layout], task.first.source) for task in tasks if task.has_weak_labels),
         "left_out": [asdict(task) for task in info.left_out],
         "headroom": headroom,
@@ -348,19 +347,25 @@ def _behaviour_counts(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _layout_rows(
-    info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str, Sequence[bool]]
+    info: ReleaseInfo, titles: Mapping[str, str], teammates: Iterable[Any], distances: Mapping[str, SplitDistance]
 ) -> list[list[str]]:
     """Return the rows of the card's table of layouts, one for each layout title.
 
     Args:
         info: info of the release, with a summary of each layout.
         titles: titles of the layouts by name, see `layout_title`.
-        matters: values of `ReferenceEgos.returns_differ` of the compared teammates, by layout title.
+        teammates: rows of the teammates, see `_teammate_rows`.
+        distances: least distances of validation to training teammates by layout, see `read_distances`.
     """
-    rows = []
+    rows, of_title = [], grouped(teammates, lambda row: titles[row["layout"]])
     for title in dict.fromkeys(titles.values()):
         own = {name: found for name, found in info.layouts.items() if titles[name] == title}
-        layouts, known = [get_layout(name) for name in own], matters.get(title)
+        layouts, mates = [get_layout(name) for name in own], of_title.get(title, [])
+        # A teammate that wants several dishes has several rows.
+        distinct = {(row["split"], row["layout"], row["teammate"], row["seed"]) for row in mates}
+        splits = Counter(split for split, *_ in distinct)
+        to_tests = [row["nearest_test"]["distance"] for row in mates if row["nearest_test"]]
+        to_training = [found.least for name, found in distances.items() if name in own]
         histories = [found.histories for found in own.values()]
         final = np.average([found.mean_final_return for found in own.values()], weights=histories)
         rows.append(
@@ -370,7 +375,8 @@ def _layout_rows(
                 f"{sum(histories):,}",
                 f"{sum(found.transitions for found in own.values()):,}",
                 f"{final:z.1f}",
-                f"{sum(known)} of {len(known)}" if known else "unknown",
+                *(f"{splits[split]}" for split in ("train", "validation")),
+                *(f"{min(found):.2f}" if found else "–" for found in (to_tests, to_training)),
             ]
         )
     return rows
@@ -423,15 +429,14 @@ def _teammate_kind(task: Task) -> str:
     return _MIXED if theta.get("random_actions") else task.teammate_family
 
 
-def _kind_rows(tasks: Iterable[_TaskFacts], layouts: Iterable[str]) -> list[list[str]]:
+def _kind_rows(tasks: Iterable[_TaskFacts]) -> list[list[str]]:
     """Return the rows of the card's table of teammates by kind, including kinds without teammates.
 
     The columns are the kind; the numbers of different teammates of the kind on the benchmark's training layouts (in
-    training, in validation) and on other layouts (the same); and the benchmark's training layouts without a training
-    teammate of the kind. A teammate that never acts, or that mixes in random actions, does not count as a member of its
-    family. There are no rows if the release has no tasks of other splits than test.
+    training, in validation) and on other layouts (the same); and the number of the benchmark's training layouts with a
+    training teammate of the kind. A teammate that never acts or mixes in random actions is no member of its family.
+    There are no rows if all tasks are of split test.
     """
-    published = [name for name in layouts if name in TESTED_ON]
     found = defaultdict[tuple[str, str, bool], set[tuple[str, str]]](set)
     for task in (one.task for one in tasks if one.task is not None and one.task.split != "test"):
         name = task.layout.name
@@ -442,9 +447,8 @@ def _kind_rows(tasks: Iterable[_TaskFacts], layouts: Iterable[str]) -> list[list
         return []
     rows, names = [], {family: f"{family} (`{kind}`)" for kind, family in HEURISTIC_KINDS.items()}
     for kind in dict.fromkeys([*named, *(kind for kind, _, _ in found)]):
-        absent = [name for name in published if name not in {layout for layout, _ in found[kind, "train", True]}]
         counts = [str(len(found[kind, split, known])) for known in (True, False) for split in ("train", "validation")]
-        rows.append([names.get(kind, kind), *counts, "all" if absent == published else ", ".join(absent)])
+        rows.append([names.get(kind, kind), *counts, str(len({layout for layout, _ in found[kind, "train", True]}))])
     return rows
 
 

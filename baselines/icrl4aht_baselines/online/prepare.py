@@ -113,7 +113,7 @@ def prepare_play(
 def _check_unused(name: str, histories: HistoryOptions) -> None:
     # Ignored options are refused, because they would be stored and make equal runs look different in tables.
     default = HistoryOptions(histories.layouts)
-    for field in ("order", "queries", "labels", "every", "first", "balance", "held_out"):
+    for field in ("order", "queries", "labels", "every", "first", "at_start", "balance", "held_out"):
         found = getattr(histories, field)
         if found != getattr(default, field):
             raise OptionError(f"{field} = {found}: {name} learns by playing, not from histories; leave out this option")

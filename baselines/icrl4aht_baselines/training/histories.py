@@ -233,11 +233,12 @@ def _sampler(
                 f"every = {every}: {method.name} learns from contexts, but only windows can skip episodes; leave out "
                 "--every"
             )
-        if histories.balance:
-            raise OptionError(
-                f"balance = True: {method.name} draws tasks, but only windows can be drawn by source; leave out "
-                "--balance"
-            )
+        for name in ("balance", "at_start"):
+            if value := getattr(histories, name):
+                raise OptionError(
+                    f"{name} = {value}: {method.name} draws tasks and contexts, and only windows can be drawn so; "
+                    f"leave out --{name.replace('_', '-')}"
+                )
         return dataset.dpt(context=options.context, order=histories.order, queries=histories.queries, **shared)
     if histories.queries > 1:
         raise OptionError(
@@ -250,9 +251,8 @@ def _sampler(
             f"context = {options.context}: the shortest history of {dataset!r} has {steps} steps for a window, with "
             f"every = {every} and first = {histories.first or 'all'}; reduce the context, or choose longer histories"
         )
-    return dataset.ad(
-        length=options.context, every=every, weights=_balanced(dataset) if histories.balance else "uniform", **shared
-    )
+    weights = _balanced(dataset) if histories.balance else "uniform"
+    return dataset.ad(length=options.context, every=every, at_start=histories.at_start, weights=weights, **shared)
 
 
 def _balanced(dataset: Dataset) -> np.ndarray:

@@ -164,7 +164,7 @@ class HistoryOptions:
     labels: Annotated[
         Labels | None,
         Option(
-            "Actions to learn: expert (greedy ones of a policy) or oracle (of a script that knows the full state).",
+            "Actions to learn: expert (of a policy, without noise) or oracle (of a script that knows the full state).",
             default="expert for dpt, the histories' own actions for the others",
         ),
     ] = None
@@ -179,6 +179,7 @@ class HistoryOptions:
             default="all",
         ),
     ] = 0
+    at_start: Annotated[Share, Option("Share of the windows that begin where a history begins, as a test does.")] = 0.0
     balance: Annotated[bool, Option("Draw windows from each source equally often, not from each history.")] = False
     held_out: Annotated[
         float,

@@ -21,6 +21,7 @@ WRONG_OPTIONS: dict[str, dict[str, Any]] = {
     r"seed = 0\.5: expected": {"seed": 0.5},
     "seed = 18446744073709551616: expected at least 0 and below": {"seed": 2**64},
     "every = 0: expected": {"every": 0},
+    "at_start = 1.5: expected": {"at_start": 1.5},
     "process_index = 0, process_count = 4, batch_size = 6": {"batch_size": 6, "process_count": 4},
     "process_index = 3, process_count = 3": {"batch_size": 6, "process_index": 3, "process_count": 3},
     r"episodes = \(6, 9\): a history with 6 episodes has no episode in this range": {"episodes": (6, 9)},

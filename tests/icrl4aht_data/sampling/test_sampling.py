@@ -47,6 +47,20 @@ def test_ad_windows_are_slices_of_histories(lite_or_full):
     assert at_the_start, "no window started at step 0, where zeros precede it"
 
 
+def test_a_share_of_the_windows_begins_at_the_start_of_a_history(lite):
+    """The other windows are drawn uniformly. Histories have 120 steps, so without the share few windows begin at 0."""
+    dataset, options = load_icrl4aht(lite[0], layout="demo_wide"), {"batch_size": 4000, "length": 20}
+    starts = {share: dataset.ad(at_start=share, **options).windows(0)[1] for share in (0.0, 0.5, 1.0)}
+    np.testing.assert_array_equal(starts[0.0], dataset.ad(**options).windows(0)[1])
+    for share, found in starts.items():
+        assert found.max() == (0 if share == 1 else 100)
+        others = found[found > 0]
+        assert np.mean(found == 0) == pytest.approx(share + (1 - share) / 101, abs=0.03)
+        assert share == 1 or others.mean() == pytest.approx(50.5, rel=0.05)
+    assert dataset.ad(at_start=0.5, **options).options()["at_start"] == 0.5
+    assert "at_start" not in dataset.ad(**options).options()
+
+
 def test_short_histories_are_padded_at_the_end(lite):
     root, written = lite
     sampler = load_icrl4aht(root, layout="coord_simple").ad(batch_size=3, length=150)

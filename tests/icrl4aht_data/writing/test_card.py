@@ -72,7 +72,7 @@ def write_meta(lite, tmp_path, monkeypatch) -> Callable[..., dict[str, Any]]:
                 changes |= {"shard": f"data/teammate/{task.layout.name}/{task.split}-00000-of-00001.h5"}
                 changes |= {"source": of_task.source, "return_start": start, "return_end": end}
                 changes |= {"has_oracle_actions": of_task.source == "noise"}
-                changes |= of_task.entry_fields(like.episodes) | fields
+                changes |= of_task.entry_fields(like.episodes, fields.get("has_expert_actions", True)) | fields
                 entries.append(msgspec.structs.replace(like, **changes))
         (tmp_path / "meta").mkdir(exist_ok=True)
         info = make_info("lite", "1.0.0", 20, entries, FORMAT_VERSION)
