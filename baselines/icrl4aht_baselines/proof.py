@@ -166,10 +166,10 @@ class ProofJob(TrainingJob):
 
     @property
     def settings_hash(self) -> str:
-        """Hash of all settings except the seed, which is equal for the runs of a row of the card's table."""
+        """Hash of learner and settings without the seed, which is equal for the runs of a row of the card's table."""
         settings = self.settings
         del settings["train"]["seed"]
-        return json_hash(settings)
+        return json_hash([LEARNERS[self.learner], settings])
 
     def finished_text(self) -> str:
         """Return text for progress displays: mean returns on the track `preference`."""
@@ -281,18 +281,18 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
         "references": references[PREFERENCE],
     }
     earlier = read_json(path)["runs"] if path.is_file() else []
-    runs = [*(one for one in earlier if one.get("settings_sha256") == _job_of(one, jobs[0]).settings_hash), *runs]
+    runs = [*(one for one in earlier if one.get("settings_sha256") == _expected_hash(one, jobs[0])), *runs]
     runs = [*{tuple(one[name] for name in RUN_KEY): one for one in runs}.values()]
     runs.sort(key=lambda one: [one[name] for name in RUN_KEY])
     write_json(path, content | {"runs": runs})
     return path
 
 
-def _job_of(entry: Mapping[str, Any], job: ProofJob) -> ProofJob:
-    """Return the job of an entry in a file of results, with the options of another job."""
+def _expected_hash(entry: Mapping[str, Any], job: ProofJob) -> str | None:
+    """Return the hash of settings of an entry's run with a job's options; None if its learner no longer exists."""
     wanted = ProofLearner(entry["method"].lower(), None if entry["labels"] == "own" else entry["labels"])
-    (learner,) = (name for name, one in LEARNERS.items() if one == wanted)
-    return replace(job, source=entry["histories"], learner=learner, seed=entry["seed"])
+    names = [name for name, one in LEARNERS.items() if one == wanted]
+    return replace(job, source=entry["histories"], learner=names[0]).settings_hash if names else None
 
 
 def run_references(options: ProofOptions, out: Path) -> dict[str, dict[str, dict[str, float]]]:

@@ -267,13 +267,13 @@ class ReferenceJob(TrainingJob):
         return folder / "lite"
 
     def teammates(self, number: int = 0) -> Any:
-        """Return the teammates of the noise histories on the track's layouts, and those of `diverse_tasks`.
+        """Return the teammates of the noise histories on the track's layouts, of `diverse_tasks` and validation tasks.
 
         Args:
             number: number of the collection, which determines the seeds of the tasks, see `release_teammates`.
         """
         noise = load_icrl4aht(self.generated_release("noise"), layout=list(TRACKS[self.track]["train"]))
-        return release_teammates(noise, number, self.diverse_tasks())
+        return release_teammates(noise, number, [*self.diverse_tasks(), *bundled_tasks(self.track, "validation")])
 
     def diverse_tasks(self) -> list[Task]:
         """Return the bundled training tasks of the track with diverse teammates; none for `EVERY_TRACK`."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import SCRIPTED_SOURCES, kind_family
-from icrl4aht_data.benchmark.tasks import Task, teammate_id
+from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import ReleaseInfo, layout_statistics, make_info
@@ -93,9 +93,9 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
 
 def _check_disjoint_teammates(tasks: Iterable[Task], report: Report) -> None:
     """Check that no task of another split has the teammate of a training task on the same track and layout."""
-    seen: dict[tuple[str, str, str], str] = {}
+    seen: dict[tuple[str, ...], str] = {}
     for task in sorted(tasks, key=lambda task: task.split != "train"):  # training tasks come first
-        key = (task.track, task.layout.name, teammate_id(task.teammate))
+        key = (task.track, task.layout.name, task.teammate_kind, json_hash(task.teammate["theta"]))
         if task.split == "train":
             seen[key] = task.task_id
         elif key in seen:

@@ -281,7 +281,11 @@ class Index:
         """
         if name == "layout":
             # A generated layout is known only once a release with it was opened, which must not change the result.
-            return str(value) if is_generated(str(value)) else get_layout(str(value)).name
+            if is_generated(str(value)) and value not in (found := self.values("layout")):
+                raise EmptySelectionError(
+                    f"{self.root}: no history has layout={value!r}. This release has layout {listed_names(found)}"
+                )
+            return get_layout(str(value)).name
         if name == "teammate_family":
             check_family(value)
         else:

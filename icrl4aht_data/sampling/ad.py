@@ -173,11 +173,15 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         # A window is drawn from the `total` steps of every n-th episode of a history's range, or without `every` from
         # all steps of the range. With `every`, an unfinished episode is excluded: its missing steps would be a gap.
         first, total = np.zeros_like(low), high - low
+        lowest, size = np.uint64(self.at_start * 2**32), np.uint64(2**32)
+        begins = for_start < lowest
         if self.every > 1:
             episodes = total // steps
-            first = scale_to_range(for_episode, np.minimum(episodes, self.every))
+            first = np.where(begins, 0, scale_to_range(for_episode, np.minimum(episodes, self.every)))
             total = -(-(episodes - first) // self.every) * steps
-        start = scale_to_range(self._without_share(for_start), np.maximum(total - self.length, 0) + 1)
+        # The lowest random numbers, a share of `at_start`, mean the first step; the others are scaled to all numbers.
+        scaled = (for_start - lowest) * size // max(size - lowest, np.uint64(1))
+        start = np.where(begins, 0, scale_to_range(scaled, np.maximum(total - self.length, 0) + 1))
         valid = np.minimum(total - start, self.length)
         if self.every == 1:
             # A window given by its first row is copied as a block, ten times faster than L single rows.
@@ -189,14 +193,6 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         # At the first step of episode `first`, `prev_*` come from the history's preceding episode, if there is one.
         rows[start == 0, 0] = (low + first * steps - 1)[start == 0]
         return position, rows[:, 1], rows[:, 1:], rows[:, :-1], valid
-
-    def _without_share(self, random: np.ndarray) -> np.ndarray:
-        """Map the lowest numbers below 2**32, a share of `at_start`, to 0, and the others to all numbers."""
-        if not self.at_start:
-            return random
-        lowest, size = np.uint64(self.at_start * 2**32), np.uint64(2**32)
-        above = (random - lowest) * size // max(size - lowest, np.uint64(1))
-        return np.where(random < lowest, np.uint64(0), above)
 
     def batch(self, i: int, out: ADBatch[np.ndarray] | None = None) -> ADBatch[np.ndarray]:
         batch = self._buffer(out)  # first, so that a batch that is too large raises an error at once

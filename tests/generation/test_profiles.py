@@ -331,7 +331,7 @@ def test_invalid_profile_raises_error_with_its_name(changed, old, new, named):
             'base = "noise"\n[tasks.sampled]\nvalidation = 4',
             r"4 drawn validation .*there are only 1 .*the 3 behaviours",
         ),
-        ('base = "search"\n[tasks]\nlayouts = ["demo_wide"]', r"\['search'\] with 1 layouts .*preference only"),
+        ('base = "search"\n[tasks]\nlayouts = ["demo_wide"]', r"\['search'\] with tasks.layouts: .*preference only"),
         ('base = "bundle"\n[noise.layouts]\ndemo_wide = 3', r"noise.layouts.demo_wide = 3: expected a table"),
         ('base = "bundle"\n[ego]\nlayouts = 3', r"ego.layouts = 3: expected a table"),
         (
@@ -355,7 +355,7 @@ def test_profile_that_extends_another_names_wrong_values(tmp_path, own, named):
 def test_extended_profile_can_leave_layouts_and_sources_out(tmp_path):
     """Values of the base for layouts that the profile leaves out have no effect."""
     path = tmp_path / "mine.toml"
-    path.write_text('base = "bundle"\n[tasks]\nlayouts = ["demo_wide"]\nsources = ["noise"]\npreference = []\n')
+    path.write_text('base = "bundle"\n[tasks]\nlayouts = ["demo_cook_wide"]\nsources = ["noise"]\npreference = []\n')
     mine, base = load_profile(str(path)), load_profile("bundle")
     noise = [work.task for work in base.units() if work.source == "noise"]
     kept = [task.task_id for task in noise if task.layout.name in mine.layouts]

@@ -16,7 +16,7 @@ from icrl4aht_generation.learners.config import EncoderKind
 from icrl4aht_generation.learners.resume import Checkpoints, differing_settings
 
 from icrl4aht_baselines.methods.method import Method
-from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.methods.options import UNUSED, ModelOptions
 from icrl4aht_baselines.methods.registry import PLAYING, get_method, overcooked_world
 from icrl4aht_baselines.methods.tokens import BatchView, plain_view
 from icrl4aht_baselines.methods.view_change import changed_view, number_layouts
@@ -358,6 +358,7 @@ def load_initial_params(run: Path, method: Method, about: dict[str, Any]) -> Any
         for name, one in ((config["method"], config), (method.name, about))
     )
     differ = differing_settings(found, expected)
+    differ = {name: values for name, values in differ.items() if name not in UNUSED.get(method.name, ())}
     if jax.tree.map(jnp.shape, before.params) != jax.tree.map(jnp.shape, shapes) or differ.keys() & _MEANINGS:
         listed = "; ".join(f"{k} = {a!r}, not {b!r}" for k, (a, b) in differ.items())
         raise OptionError(f"{run}: trained with other options ({listed}); give these options, or another run")

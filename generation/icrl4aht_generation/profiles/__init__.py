@@ -146,8 +146,7 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
                 f"tasks.generated: {len(alone)} of {len(profile.generated)} layouts have no teammate, such as "
                 f"{alone[0]}: expected teammates = 1 or more in its table"
             )
-        _check_sections(profile.sampled, profile.spread)
-        check_splits(units)
+        _check_splits(units, profile.sampled, profile.spread)
     return profile
 
 
@@ -165,12 +164,13 @@ def _read_content(path: Path) -> dict[str, Any]:
 
 
 def _chosen_layouts(content: Mapping[str, Any]) -> set[str]:
-    """Return the names in tasks.layouts and tasks.preference; empty if a value is malformed."""
+    """Return the short names in tasks.layouts and tasks.preference; empty if a value is malformed."""
     try:
         found = msgspec.convert(content, _ProfileFile).tasks
     except msgspec.ValidationError:
         return set()
-    return {*found.layouts, *(PREFERENCE_LAYOUTS["train"] if found.preference == ("all",) else found.preference)}
+    preference = PREFERENCE_LAYOUTS["train"] if found.preference == ("all",) else found.preference
+    return {get_layout(name).name for name in (*found.layouts, *preference)}
 
 
 def _without_keys(table: Mapping[str, Any], keys: set[str]) -> dict[str, Any]:
@@ -229,11 +229,11 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
         generated |= dict.fromkeys(names[len(generated) :], one.teammates)
     layouts += tuple(generated)
     _check_known("source", "tasks.sources", sources, REBUILT_SOURCES)
-    if sources == ("search",) and (layouts or tasks.sampled or tasks.spread or tasks.algorithms):
+    ignored = [name for name in ("layouts", "generated", "sampled", "spread", "algorithms") if getattr(tasks, name)]
+    if sources == ("search",) and ignored:
         raise OptionError(
-            f"tasks.sources = ['search'] with {len(layouts)} layouts in tasks.layouts and tasks.generated: search "
-            f"plays the layouts in tasks.preference only; add another source, or remove tasks.layouts, "
-            f"tasks.generated, tasks.sampled, tasks.spread and tasks.algorithms"
+            f"tasks.sources = ['search'] with {', '.join(f'tasks.{name}' for name in ignored)}: search plays the "
+            f"layouts in tasks.preference only; add another source, or leave out these keys, as in the profile search"
         )
     if not layouts and sources != ("search",):
         raise OptionError("tasks.layouts: expected layouts, found none; name layouts, or add tasks.generated")
@@ -321,8 +321,12 @@ def _teammate_counts(
     return counts
 
 
-def _check_sections(sampled: SampledConfig | None, spread: SpreadConfig | None) -> None:
-    """Check that no layout has both sampled and spread teammates."""
+def _check_splits(units: Sequence[WorkUnit], sampled: SampledConfig | None, spread: SpreadConfig | None) -> None:
+    """Check that no teammate of a layout's validation split acts like a teammate of its training split.
+
+    Raises:
+        OptionError: if a behaviour is in both splits, or a layout has both sampled and spread teammates.
+    """
     for name in spread.per_layout if spread and sampled else ():
         both = [config.per_layout[name] + config.validation[name] for config in (sampled, spread) if config]
         if all(both):
@@ -331,20 +335,13 @@ def _check_sections(sampled: SampledConfig | None, spread: SpreadConfig | None) 
                 f"one section may resemble training teammates of the other; use only one section for a layout"
             )
 
-
-def check_splits(units: Sequence[WorkUnit]) -> None:
-    """Check that no teammate of a layout's validation split acts like a teammate of its training split.
-
-    Raises:
-        OptionError: if a behaviour is in both splits; the message states the number of such validation tasks.
-    """
     trained = {_teammate_key(work) for work in units if work.task.split == "train"}
     checked = {work.task.task_id: _teammate_key(work) for work in units if work.task.split == "validation"}
     shared = [task for task, key in checked.items() if key in trained]
     if shared:
         raise OptionError(
             f"{len(shared)} of {len(checked)} validation tasks have a teammate that acts like a training teammate, "
-            f"such as {min(shared)}: remove such teammates from the given tasks, or from tasks.presets in a profile"
+            f"such as {min(shared)}: remove such teammates from tasks.presets, or request fewer validation teammates"
         )
 
 

@@ -23,7 +23,7 @@ from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
 from icrl4aht_generation.populations.build import build_suite
 from icrl4aht_generation.populations.select import THRESHOLD, make_tasks
-from icrl4aht_generation.profiles import Profile, WorkUnit, check_splits
+from icrl4aht_generation.profiles import Profile, WorkUnit
 from icrl4aht_generation.releases.measures import learned_reference_returns, teammate_facts
 from icrl4aht_generation.releases.package import check_release_folder, package_release
 
@@ -75,7 +75,6 @@ def build_releases(
         units, headroom, left_out = train_teammates(profile, suite, seed, console, options)
     else:
         units, headroom, left_out = profile.units_of(tasks, sources or {}), {}, []
-        check_splits(units)
     played = dict.fromkeys([*profile.layouts, *(work.task.layout.name for work in units)])
     generated = tuple(get_layout(name) for name in played if name not in LAYOUTS)
     jobs = [CollectionJob(work, profile, out / "artefacts", suite, generated) for work in units]

@@ -318,6 +318,7 @@ class TestHeldOut:
     def test_sampler_options_are_passed_on(self, two_sources):
         found = training_job(two_sources[0], context=40, every=3)
         assert {sampler.every for sampler in (found.data.train, *found.data.validation.values())} == {3}
+        assert training_job(two_sources[0], at_start=0.5).data.train.at_start == 0.5
         dpt = training_job(two_sources[0], "dpt", context=40, queries=3)
         assert dpt.data.train[0].query_target.shape == (OPTIONS.batch_size, 3)
 

@@ -95,7 +95,7 @@ class TestReleaseWithLayouts:
             load_icrl4aht(root, layout_family="rooms")
 
     def test_layout_and_kind_that_exist_elsewhere_give_an_empty_selection(self, root):
-        for wanted in ({"layout": "rooms-99-7"}, {"teammate_kind": "comedi"}):
+        for wanted in ({"layout": ["mine-3-5", "mine-3-6"]}, {"teammate_kind": "comedi"}):
             with pytest.raises(EmptySelectionError, match=r"no history has .*This release has"):
                 load_icrl4aht(root, **wanted)
 
