@@ -6,6 +6,7 @@ import dataclasses
 import json
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -95,7 +96,8 @@ class TestReleaseWithLayouts:
             load_icrl4aht(root, layout_family="rooms")
 
     def test_layout_and_kind_that_exist_elsewhere_give_an_empty_selection(self, root):
-        for wanted in ({"layout": ["mine-3-5", "mine-3-6"]}, {"teammate_kind": "comedi"}):
+        absent: list[dict[str, Any]] = [{"layout": ["mine-3-5", "mine-3-6"]}, {"teammate_kind": "comedi"}]
+        for wanted in absent:
             with pytest.raises(EmptySelectionError, match=r"no history has .*This release has"):
                 load_icrl4aht(root, **wanted)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,7 +50,8 @@ def test_ad_windows_are_slices_of_histories(lite_or_full):
 
 def test_a_share_of_the_windows_begins_at_the_start_of_a_history(lite):
     """The other windows are drawn uniformly. Histories have 120 steps, so without the share few windows begin at 0."""
-    dataset, options = load_icrl4aht(lite[0], layout="demo_wide"), {"batch_size": 4000, "length": 20}
+    dataset = load_icrl4aht(lite[0], layout="demo_wide")
+    options: Any = {"batch_size": 4000, "length": 20}
     starts = {share: dataset.ad(at_start=share, **options).windows(0)[1] for share in (0.0, 0.5, 1.0)}
     np.testing.assert_array_equal(starts[0.0], dataset.ad(**options).windows(0)[1])
     for share, found in starts.items():
