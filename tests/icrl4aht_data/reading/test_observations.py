@@ -290,7 +290,9 @@ def test_combine_accepts_releases_of_observations(converted_release, published_f
     index.write_text(index.read_text().replace('": "task_', '": "more_'))
     from_published(other, tmp_path / "more", kept_steps=KEPT)
     combine_releases(tmp_path / "out", [converted_release, tmp_path / "more"])
-    assert verify_release(tmp_path / "out", level="deep").ok
+    report = verify_release(tmp_path / "out", level="deep")  # the second release is a copy with other names of tasks
+    assert len(report.findings) == 4
+    assert all("has the content of history" in finding.problem for finding in report.findings)
     combined = load_icrl4aht(tmp_path / "out", obs="uint8")
     assert len(combined) == 8
     assert not combined.has_tasks
