@@ -213,12 +213,12 @@ def prepare_training(
     options = TrainOptions(**SIZES[name].train | {"batch_size": batch_size} | train)
     job = prepare(method, sized, options, histories)
     reason = "" if size else f", the default {'on a CPU' if on_cpu else 'on this device'}"
-    trunk = f"layers {sized.layers}, positions {sized.positions}"
+    layers, positions = f"layers {sized.layers}", f", positions {sized.positions}"
     if method == "hybrid_ad":
-        trunk = f"GRU layers {sized.recurrent_layers}"
+        layers, positions = f"GRU layers {sized.recurrent_layers}", ""
     text = (
-        f"size {name}{reason}: {trunk}, width {sized.width}, encoder {sized.encoder}, K = {options.context}, steps "
-        f"{options.steps}, batch size {options.batch_size}\n"
+        f"size {name}{reason}: {layers}, width {sized.width}, encoder {sized.encoder}{positions}, K = "
+        f"{options.context}, steps {options.steps}, batch size {options.batch_size}\n"
         f"{training_summary(job.about['histories'])}"
     )
     return job, text
