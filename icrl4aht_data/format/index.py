@@ -257,17 +257,19 @@ class Index:
             names = ("split", "layout", "teammate_family", "source", *("label_view",) * ("label_view" in filters))
             known = {name: listed_names([one or "not recorded" for one in self.values(name)]) for name in names}
             found = "; ".join(f"{name} {values or 'none'}" for name, values in known.items())
-            raise EmptySelectionError(f"{self.root}: no history has {what}. This release has {found}")
+            raise self._no_history(what, found)
         return np.flatnonzero(matching)
+
+    def _no_history(self, what: str, found: str) -> EmptySelectionError:
+        return EmptySelectionError(f"{self.root}: no history has {what}. This release has {found}")
 
     def _family_layouts(self, families: Iterable[str]) -> list[str]:
         """Return the layouts of the release that belong to any of the families."""
         by_family, families = grouped(self.values("layout"), layout_family), list(families)
         for family in families:
             if family not in by_family:
-                raise EmptySelectionError(
-                    f"{self.root}: no history has {LAYOUT_FAMILY}={family!r}. This release has {LAYOUT_FAMILY} "
-                    f"{listed_names(list(by_family))}"
+                raise self._no_history(
+                    f"{LAYOUT_FAMILY}={family!r}", f"{LAYOUT_FAMILY} {listed_names(list(by_family))}"
                 )
         return [layout for family in families for layout in by_family[family]]
 
@@ -282,9 +284,7 @@ class Index:
         if name == "layout":
             # A generated layout is known only once a release with it was opened, which must not change the result.
             if is_generated(str(value)) and value not in (found := self.values("layout")):
-                raise EmptySelectionError(
-                    f"{self.root}: no history has layout={value!r}. This release has layout {listed_names(found)}"
-                )
+                raise self._no_history(f"layout={value!r}", f"layout {listed_names(found)}")
             return get_layout(str(value)).name
         if name == "teammate_family":
             check_family(value)

@@ -251,8 +251,8 @@ def _warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
     names = [values[code] for code in codes.tolist()]
     if labels == "expert":
         earned = dataset.column("expert_return")[first]
-        advice = "leave them out by min_expert_return, or, if some returns are unknown, ds.select(~(ds.column("
-        advice += "'expert_return') < LEAST))"
+        weaker = "ds.column('expert_return') < LEAST"
+        advice = f"leave them out by min_expert_return, or, if some returns are unknown, ds.select(~({weaker}))"
     else:
         # The reference is the return with the task's first teammate, so it is no measure if teammates change.
         made = [dataset.provenance.of(name) for name in names]

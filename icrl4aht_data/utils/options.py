@@ -132,9 +132,11 @@ def replace_options(options: Options, values: Mapping[str, Any], where: str = ""
         where: prefix of field names in messages, such as "ego.".
 
     Raises:
-        OptionError: if a check of the dataclass fails, or the value for a nested dataclass is not a mapping.
+        OptionError: if a check of the dataclass fails, or `values`, also for a nested dataclass, is not a mapping.
         UnknownNameError: if a field does not exist.
     """
+    if not isinstance(values, Mapping):
+        raise OptionError(f"{where.removesuffix('.')} = {values!r}: expected a table")
     instance: Any = options
     known = [field.name for field in dataclasses.fields(instance)]
     changes = {}
@@ -142,8 +144,6 @@ def replace_options(options: Options, values: Mapping[str, Any], where: str = ""
         if name not in known:
             raise unknown_name("key", where + name, [where + each for each in known])
         before = getattr(instance, name)
-        if dataclasses.is_dataclass(before) and not isinstance(value, Mapping):
-            raise OptionError(f"{where}{name} = {value!r}: expected a table")
         nested = dataclasses.is_dataclass(before)
         changes[name] = replace_options(before, value, f"{where}{name}.") if nested else value
     try:

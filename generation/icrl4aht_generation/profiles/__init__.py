@@ -280,9 +280,8 @@ def _read_section(
     """Return the settings of a section, and the settings of each layout in the section's table `layouts`."""
     common = replace_options(default, {key: value for key, value in values.items() if key != "layouts"}, f"{name}.")
     tables = values.get("layouts", {})
-    for key, table in {"": tables, **(tables if isinstance(tables, dict) else {})}.items():
-        if not isinstance(table, dict):
-            raise OptionError(f"{name}.layouts{key and '.' + key} = {table!r}: expected a table")
+    if not isinstance(tables, dict):
+        raise OptionError(f"{name}.layouts = {tables!r}: expected a table")
     own: dict[str, Any] = _by_layout(f"{name}.layouts", tables, layouts)
     return common, {each: replace_options(common, of, f"{name}.layouts.{each}.") for each, of in own.items()}
 
@@ -346,7 +345,7 @@ def _check_splits(units: Sequence[WorkUnit], sampled: SampledConfig | None, spre
 
 
 def _teammate_key(work: WorkUnit) -> tuple[Any, ...]:
-    """Return a key that is equal for units on one layout with the same recipes whose teammates act alike."""
+    """Return a key of a unit's layout, recipes and teammate. Teammates with the same behaviour have equal keys."""
     layout, teammate = work.task.layout.name, work.task.teammate
     draw = find_draw(layout, teammate) if "theta_id" in teammate else None
     acts: tuple[Any, ...] = (teammate_id(teammate),) if draw is None else (draw.family, draw.behaviour)
