@@ -213,9 +213,8 @@ def prepare_training(
     options = TrainOptions(**SIZES[name].train | {"batch_size": batch_size} | train)
     job = prepare(method, sized, options, histories)
     reason = "" if size else f", the default {'on a CPU' if on_cpu else 'on this device'}"
-    layers, positions = f"layers {sized.layers}", f", positions {sized.positions}"
-    if method == "hybrid_ad":
-        layers, positions = f"GRU layers {sized.recurrent_layers}", ""
+    layers = f"GRU layers {sized.recurrent_layers}" if method == "hybrid_ad" else f"layers {sized.layers}"
+    positions = "" if "positions" in UNUSED.get(method, ()) else f", positions {sized.positions}"
     text = (
         f"size {name}{reason}: {layers}, width {sized.width}, encoder {sized.encoder}{positions}, K = "
         f"{options.context}, steps {options.steps}, batch size {options.batch_size}\n"

@@ -258,10 +258,10 @@ def train_command(
 ) -> None:
     """Train a model on learning histories.
 
-    METHOD is ad, dpt, hybrid_ad or amago_offline, or rl2, which learns by playing with the teammates of the histories.
-    Writes settings, checkpoints, metrics.jsonl and, if matplotlib is installed, curves.png into OUT. The same command
-    resumes from the last checkpoint. SIGTERM and Ctrl-C save a checkpoint after the running step; a second Ctrl-C stops
-    at once.
+    METHOD is ad, dpt, hybrid_ad, amago_offline or bc (cloning without memory), or rl2, which learns by playing with the
+    teammates of the histories. Writes settings, checkpoints, metrics.jsonl and, if matplotlib is installed, curves.png
+    into OUT. The same command resumes from the last checkpoint. SIGTERM and Ctrl-C save a checkpoint after the running
+    step; a second Ctrl-C stops at once.
     """
     shared.join_processes(**machines)
     from icrl4aht_baselines.methods.registry import PLAYING

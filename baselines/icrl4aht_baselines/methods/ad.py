@@ -26,7 +26,7 @@ from icrl4aht_baselines.methods.method import (
     squared_error,
 )
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.methods.tokens import StepInput, StepTokenizer, batch_steps
+from icrl4aht_baselines.methods.tokens import StepInput, StepTokenizer, Tokenizer, batch_steps
 from icrl4aht_data.sampling.ad import ADBatch
 
 
@@ -57,14 +57,14 @@ class WindowMemory(NamedTuple):
 
 
 class StepModel(nn.Module):
-    """Model of AD, Hybrid-AD and AMAGO-Offline: a tokenizer of steps, a trunk, and a head.
+    """Model of AD, Hybrid-AD, AMAGO-Offline and BC: a tokenizer of steps, a trunk, and a head.
 
     A trunk takes complete sequences of tokens (B, L, D), or one token at a time by `advance(token, memory)`, with a
     memory from `start(context)` or `start_after(tokens, context)`. A trunk is causal, and padding is at the end of
     sequences, so padding needs no mask except in the loss.
     """
 
-    tokens: StepTokenizer
+    tokens: Tokenizer
     trunk: Any
     head: nn.Module
     next_obs: nn.Module | None = None
@@ -122,9 +122,11 @@ def dropped_steps(context: int) -> int:
     return max(1, context // 5)
 
 
-def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module) -> StepModel:
-    """Return a `StepModel` with the given trunk and head."""
-    return StepModel(make_tokenizer(StepTokenizer, options, world), trunk, head, make_next_obs_head(options, world))
+def make_step_model(
+    options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module, tokenizer: type[Tokenizer] = StepTokenizer
+) -> StepModel:
+    """Return a `StepModel` with the given trunk and head, and a tokenizer of the given class."""
+    return StepModel(make_tokenizer(tokenizer, options, world), trunk, head, make_next_obs_head(options, world))
 
 
 def step_method(name: str, label: str, model: StepModel, loss: Loss, world: World, **settings: Any) -> Method:
@@ -151,13 +153,20 @@ def auxiliary_losses(output: StepOutput, steps: StepInput, batch: ADBatch, world
     return {"next_obs_loss": mean_of_rows(errors, valid)}
 
 
-def action_method(name: str, label: str, options: ModelOptions, world: World, trunk: nn.Module) -> Method:
-    """Return the method Algorithm Distillation with the given trunk.
+def action_method(
+    name: str,
+    label: str,
+    options: ModelOptions,
+    world: World,
+    trunk: nn.Module,
+    tokenizer: type[Tokenizer] = StepTokenizer,
+) -> Method:
+    """Return the method Algorithm Distillation with the given trunk and a tokenizer of the given class.
 
     The loss is the cross-entropy of the target actions over valid positions (paper, App. E.2). The target actions are
     the actions of the history, or its labels.
     """
-    model = make_step_model(options, world, trunk, nn.Dense(world.actions))
+    model = make_step_model(options, world, trunk, nn.Dense(world.actions), tokenizer)
 
     def loss(params: Any, slow: Any, batch: ADBatch, key: Any) -> tuple[Array, dict[str, Array]]:
         steps, mask = batch_steps(batch, world.view), jnp.asarray(batch.attention_mask)

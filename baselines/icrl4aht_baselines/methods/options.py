@@ -102,6 +102,7 @@ UNUSED = {
     "dpt": {"recurrent_layers", "discounts"},
     "hybrid_ad": {*_TRANSFORMER, "discounts"},
     "amago_offline": {"recurrent_layers"},
+    "bc": {"heads", "positions", "remat", "recurrent_layers", "discounts", "teammate_actions", "reward_scale"},
     "rl2": {
         *(*_TRANSFORMER, "discounts", "dropout", "next_obs", "label_smoothing", "bfloat16"),
         *("context", "accumulate", "weight_decay", "validate_every", "validation_batches"),

@@ -10,6 +10,7 @@ from icrl4aht_generation.learners.encoder import CompactView, WindowEncoder
 
 from icrl4aht_baselines.methods.ad import ad
 from icrl4aht_baselines.methods.amago_offline import amago_offline
+from icrl4aht_baselines.methods.bc import bc
 from icrl4aht_baselines.methods.dpt import dpt
 from icrl4aht_baselines.methods.hybrid_ad import hybrid_ad
 from icrl4aht_baselines.methods.method import Method, World
@@ -26,6 +27,7 @@ METHODS: dict[str, Callable[[ModelOptions, World], Method]] = {
     "dpt": dpt,
     "hybrid_ad": hybrid_ad,
     "amago_offline": amago_offline,
+    "bc": bc,
     "rl2": rl2,
 }
 """Name -> function from (ModelOptions, World) to the method. Scripts may add methods."""

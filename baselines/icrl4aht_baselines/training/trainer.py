@@ -278,7 +278,7 @@ class TrainingTask(NamedTuple):
             batches = stack.enter_context(trainer.batches(self.data.train, first, options.steps))
             # Handlers are installed after the setup, so a signal during the setup ends the process.
             stop = stack.enter_context(stop_signals())
-            before = first, time.perf_counter(), 0.0
+            before = first, time.perf_counter()
             save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * SAVE_MINUTES)
             loss: float | None = None
             for step, batch in enumerate(batches, start=first + 1):
@@ -292,11 +292,9 @@ class TrainingTask(NamedTuple):
                 if self.data.validation and (step % options.validate_every == 0 or last):
                     lines += trainer.validation_lines(state, self.data.validation, step)
                 if lines:
-                    waited = getattr(batches, "waited", 0.0)  # methods that learn by playing have no loader
-                    now = step, time.perf_counter(), waited
-                    steps, seconds, waited = np.subtract(now, before)
-                    speed = {"steps_per_second": round(steps / seconds, 4), "loader_wait": round(waited / seconds, 4)}
-                    log.write(*lines, timing={"step": step, **speed})
+                    now = step, time.perf_counter()
+                    steps, seconds = np.subtract(now, before)
+                    log.write(*lines, timing={"step": step, "steps_per_second": round(steps / seconds, 4)})
                     before = now
                     write_lines(loggers, lines)
                 saves, stopped_by = agree_on_stop(save.due(step), stop[0] if stop else 0)

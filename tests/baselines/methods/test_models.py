@@ -88,6 +88,21 @@ def test_outputs_depend_only_on_past_and_present_steps(name, positions):
         np.testing.assert_array_equal(found, np.tril(np.ones((7, 7), bool)))
 
 
+def test_behaviour_cloning_sees_the_present_observation_only():
+    method, params = tiny_method("bc")
+    steps = batch_steps(ad_batch(rows=1), plain_view)
+
+    def policy(obs, rewards):
+        changed = steps._replace(obs=obs[None], prev_reward=rewards[None])
+        return apply_model(method, params, changed).head[0]
+
+    seen, rewarded = dependence_masks(policy, steps.obs[0], steps.prev_reward[0])
+    np.testing.assert_array_equal(seen, np.eye(7, dtype=bool))
+    assert not rewarded.any()
+    other = steps._replace(prev_action=(steps.prev_action + 1) % 4, prev_teammate_action=steps.prev_action)
+    np.testing.assert_array_equal(*(apply_model(method, params, one).head for one in (steps, other)))
+
+
 @pytest.mark.parametrize("name", STEPS)
 def test_policies_depend_on_earlier_actions_of_both_agents(name):
     method, params = tiny_method(name)
@@ -296,7 +311,7 @@ def test_cached_acting_equals_exact_acting_until_the_window_is_full(name, positi
     assert np.abs(np.diff(exact, axis=0)).min() > 0
 
 
-@pytest.mark.parametrize("name", STEPS)
+@pytest.mark.parametrize("name", [*STEPS, "bc"])
 def test_outputs_while_acting_equal_outputs_in_training(name):
     method, params = tiny_method(name)
     seen = ego_inputs(9, episode=4)
