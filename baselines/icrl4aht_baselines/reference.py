@@ -29,7 +29,8 @@ from msgspec import to_builtins
 
 from icrl4aht_baselines.agents.bundled import EVERY_TRACK, MODEL_CARD, MODELS, format_track
 from icrl4aht_baselines.agents.egos import find_agent
-from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
+from icrl4aht_baselines.evaluate.protocols import CONTROLS, bundled_tasks, get_protocol
+from icrl4aht_baselines.evaluate.rollout import ProgramCache
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
 from icrl4aht_baselines.online.agent_histories import collect_release, release_teammates
 from icrl4aht_baselines.online.prepare import prepare_play
@@ -49,7 +50,7 @@ from icrl4aht_baselines.training.job import TrainingJob
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
 from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, KEPT_STEPS, TRACKS
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, KEPT_STEPS, TRACKS, layout_track
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
@@ -339,21 +340,28 @@ class ReferenceJob(TrainingJob):
         return mixed
 
     def evaluation_tasks(self, split: str) -> list[Task]:
-        """Return the tasks of a split on the track, or on all tracks that have tasks of the split."""
-        published = tuple(TRACKS) if split == "diverse" else ALL_TRACKS
-        tracks = published if self.track == EVERY_TRACK else (self.track,)
-        return [task for track in tracks for task in bundled_tasks(track, split)]
+        """Return the tasks of a split that the model plays as a bundled model.
+
+        A model of one track also plays those tasks of the track `preference` whose layouts belong to its track.
+        """
+        tracks = tuple(TRACKS) if split == "diverse" else ALL_TRACKS
+        tasks = [task for track in tracks for task in bundled_tasks(track, split)]
+        return [task for task in tasks if self.track in (EVERY_TRACK, layout_track(task.layout.name))]
 
     def results(self, kind: str) -> Path:
         """Return the folder of the job's results; `kind` is a name in `EVALUATIONS`."""
         return self.folder / "results" / kind
 
     def evaluate(self, show: Callable[..., None]) -> None:
-        """Evaluate the trained model, with the function `show` for progress."""
+        """Evaluate the trained model, with the function `show` for progress; on test tasks also with controls."""
         agent = find_agent(self.run_folder, greedy=self.reference.greedy)._replace(name=self.model)
+        programs = ProgramCache()
         for kind, (split, protocol, seeds) in EVALUATIONS.items():
-            shown: Any = {"seeds": range(seeds), "show": show, "what": f"{self.name}, {kind}"}
-            evaluate_agent(agent, self.evaluation_tasks(split), get_protocol(protocol), self.results(kind), **shown)
+            for control in (None, *CONTROLS) if kind == "test-seeded" else (None,):
+                out, what = self.results(kind) / (control or ""), " ".join(filter(None, (self.name, kind, control)))
+                shown: Any = {"seeds": range(seeds), "show": show, "what": what, "programs": programs}
+                tasks = self.evaluation_tasks(split)
+                evaluate_agent(agent, tasks, get_protocol(protocol), out, control=control, **shown)
 
 
 def write_bundled_card(name: str, jobs: Sequence[ReferenceJob], folder: Path = MODELS) -> Path:

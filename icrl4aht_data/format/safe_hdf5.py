@@ -35,10 +35,10 @@ _ATTRIBUTES = 16
 def check_no_local_heap(path: Path) -> None:
     """Check that a shard has no local heap: a forged heap can have an endless free list, which libhdf5 would follow.
 
-    Shards written by this package have no local heap, since groups do not need local heaps from HDF5 1.8 on.
+    Shards written by this package have no local heap, since groups in the format of HDF5 1.8 need none.
 
     Raises:
-        ValueError: if the file has a local heap, or is of an older HDF5 version.
+        ValueError: if the file has a local heap, or its format is older than HDF5 1.8.
     """
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         if not data[:11].startswith(_SUPERBLOCKS):

@@ -55,7 +55,7 @@ class Curriculum:
             raise OptionError(f"curriculum {name} = {part!r}: expected fractions 0 <= low < high <= 1")
 
     def part(self, i: int) -> tuple[float, float]:
-        """Return the low and the high fraction of the part at batch i."""
+        """Return the part of histories at batch i, as fractions (low, high)."""
         share = min(1.0, i / self.batches)
         low, high = (a + (b - a) * share for a, b in zip(self.first, self.last, strict=True))
         return low, high

@@ -23,7 +23,7 @@ from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, TRACKS
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.writing.convert import to_release
@@ -117,7 +117,9 @@ def test_model_of_all_tracks_is_evaluated_on_all_tracks(tmp_path):
     job = ReferenceJob("rl2-adapting", EVERY_TRACK, 0, tmp_path)
     assert {task.track for task in job.evaluation_tasks("test")} == {*ALL_TRACKS}
     assert {task.track for task in job.evaluation_tasks("diverse")} == {*TRACKS}
-    assert {task.track for task in ReferenceJob("x", "layout", 0, tmp_path).evaluation_tasks("test")} == {"layout"}
+    own = [ReferenceJob("x", track, 0, tmp_path).evaluation_tasks("test") for track in TRACKS]
+    assert {task.track for task in own[1]} == {"layout", PREFERENCE}
+    assert sum(map(len, own)) == len(job.evaluation_tasks("test")), "each task is played by one model"
 
 
 def test_histories_of_teachers_with_equal_folder_names_are_recorded_separately(tmp_path, monkeypatch):

@@ -225,7 +225,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ),
     (
         "docs/preference",
-        "test_wide {} of the {} training tasks .. on asymm_both {} of {}.",
+        "test_wide_plain {} of the {} training tasks .. on asymm_both_plain {} of {}.",
         training_teammates_like_tests,
     ),
     ("docs/index", "{} test tasks", lambda: len(bundled_tasks("test"))),
@@ -274,7 +274,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/training", "{} layers of width {}, .. K = {}", tiny_model_size),
     ("docs/training", "{} steps take", lambda: TINY_SIZE.train["steps"]),
     ("docs/training", "every {} minutes", lambda: SAVE_MINUTES),
-    ("docs/training", "{} of the histories are held out", lambda: HistoryOptions(("demo_wide",)).held_out),
+    ("docs/training", "{} of the histories (`--held-out`)", lambda: HistoryOptions(("demo_wide",)).held_out),
     ("docs/format", "`format_version` {}. Version {}", lambda: READABLE_VERSIONS[::-1]),
     ("docs/format", "cooked, 0 to {}", lambda: POT_STEPS),
     ("docs/format", "stays on, 0 to {}", lambda: BUTTON_STEPS),

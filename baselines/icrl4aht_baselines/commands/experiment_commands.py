@@ -135,7 +135,8 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
 def _model_returns() -> dict[str, dict[str, Any]]:
     """Return model -> task id -> mean return on test tasks with each of `SUBMITTED_SEEDS`, from the stored results.
 
-    Results of controls, in which an ego's memory is cleared or another teammate plays, are left out.
+    Each training run is a model. Results of controls, in which an ego's memory is cleared or another teammate plays,
+    are left out.
     """
     from icrl4aht_baselines.evaluate.protocols import SUBMITTED_SEEDS
     from icrl4aht_baselines.report.results import bundled_tasks_by_id, task_label
@@ -143,15 +144,13 @@ def _model_returns() -> dict[str, dict[str, Any]]:
 
     ids = {task_label(task): task for task in bundled_tasks_by_id("test", ALL_TRACKS)}
     stored = read_stored(results_file())
-    return {
-        agent: {
-            ids[task]: values
-            for of in cells.values()
-            if of.seeds == SUBMITTED_SEEDS
-            for task, values in zip(of.tasks, of.mean, strict=True)
-        }
-        for agent, cells in stored.with_other_play_modes(stored.returns()).items()
-    }
+    found: dict[str, dict[str, Any]] = defaultdict(dict)
+    for agent, cells in stored.with_other_play_modes(stored.returns()).items():
+        for of in (of for of in cells.values() if of.seeds == SUBMITTED_SEEDS):
+            for training, returns in zip(of.trainings, of.blocks["all"], strict=True):
+                model = f"{agent}, training run {training}" if training else agent
+                found[model] |= {ids[task]: values for task, values in zip(of.tasks, returns, strict=True)}
+    return found
 
 
 @click.command(

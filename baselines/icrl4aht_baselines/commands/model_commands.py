@@ -282,8 +282,10 @@ def submit_command(
     check_output(out, overwrite)
     found = submission.make_submission(folders, submission.AgentFacts(**facts), name, update)
     stored = stored_results.read_stored(stored_results.results_file())
-    stored_results.add_submission(stored, found, ", ".join(map(str, folders)))  # raises errors
+    added = stored_results.add_submission(stored, found, ", ".join(map(str, folders)))  # raises errors
     submission.write_submission(out, found)
+    for line in stored_results.describe_removed(stored, added, found.agent):
+        click.echo(f"the update removes stored results of {found.agent}: {line}")
     click.echo(f"wrote {out}: {found.agent}, {' and '.join(found.tracks)}; `icrl4aht-data results {out}` shows it")
 
 
@@ -313,10 +315,10 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
     for path in files:
         found = read_submission(path)
         stored = stored_results.add_submission(stored, found, str(path))
-    if store:
-        stored_results.write_stored(stored_results.results_file(), stored)
     for path in comparison.write_comparison(stored, out):
         click.echo(f"wrote {path}")
+    if store:  # after the page, so that nothing is stored if the page cannot be written
+        stored_results.write_stored(stored_results.results_file(), stored)
 
 
 @click.command("models")

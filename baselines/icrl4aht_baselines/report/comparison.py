@@ -35,13 +35,13 @@ from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.adaptation import published_adaptation_table
 from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE, TRACKS, layout_track
 from icrl4aht_data.benchmark.reference_returns import read_reference_returns
 from icrl4aht_data.plotting import add_legend_below, average_in_blocks, axis_limits, save_figure
 from icrl4aht_data.reading.arrow_tables import import_pyarrow
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.groups import grouped
-from icrl4aht_data.utils.text import fill_template, markdown_table
+from icrl4aht_data.utils.text import counted_noun, fill_template, markdown_table
 
 RESULTS_FILES = ("results.md", "results.png", "results.csv", "results.parquet")
 
@@ -138,7 +138,7 @@ def secondary_effects(
 ) -> dict[tuple[str, ...], SecondaryEffect]:
     """Return all effects that the page tests besides the primary endpoint, see `SecondaryEffects`.
 
-    Agents are compared with the agent that has the next lower N on the track, paired by task, seed and training run.
+    Agents are compared with the agent that has the next lower N on the track, paired by task and seed.
     """
     found: dict[tuple[str, ...], MeanInterval] = {}
     for track in ALL_TRACKS:
@@ -173,7 +173,7 @@ def agents_table(
         if facts:
             hours = "" if facts.core_hours is None else f"{facts.core_hours:g} core-hours"
             texts = [facts.data, facts.labels, ", ".join(filter(None, (facts.steps, hours))) or "–"]
-        row = [f"`{agent}`{overlap_marks(marks)}", *texts]
+        row = [f"`{agent}`{overlap_marks(marks)}{_runs_text(cells)}", *texts]
         for track in ALL_TRACKS:
             score = find_score(cells, cells_with_headroom(scales, track), scales)
             tested = effects.get(("N", track, agent))
@@ -182,6 +182,19 @@ def agents_table(
         body.append(row)
     scored = [f"{name}, {track}" for track in ALL_TRACKS for name in ("N", "IQM")]
     return markdown_table(["model", "data", "labels", "budget", *scored], body)
+
+
+def _runs_text(cells: AgentReturns) -> str:
+    """Return text with the number of an agent's training runs, or an empty string if it was trained once."""
+    runs = {
+        PREFERENCE if cell.kind == PREFERENCE else PUBLISHED_TRACKS: len(of.trainings) for cell, of in cells.items()
+    }
+    if {*runs.values()} <= {1}:
+        return ""
+    if len({*runs.values()}) == 1:
+        return f" ({max(runs.values())} runs)"
+    texts = [f"{where} {counted_noun(number, 'run')}" for where, number in runs.items()]
+    return f" ({', '.join(texts)})"
 
 
 def describe_differences(effects: SecondaryEffects) -> str:
@@ -208,10 +221,12 @@ def controls_table(results: Mapping[str, AgentReturns], scales: CellScales, effe
             if not units:
                 continue
             tested = (effects.get((control, where, agent)) for control in ("cleared", "swapped"))
-            row = [f"`{agent}`", where, *(effect.text(1) if effect else "–" for effect in tested)]
+            tracks = {layout_track(cell.layout): None for cell in chosen}
+            played = where if where == PREFERENCE or tracks.keys() >= {*TRACKS} else ", ".join(tracks)
+            row = [f"`{agent}`", played, *(effect.text(1) if effect else "–" for effect in tested)]
             for block in EPISODE_BLOCKS:
-                played = [[cells[cell].blocks[block] for cell in unit if block in cells[cell].blocks] for unit in units]
-                parts = [np.concatenate(of, axis=1) for of in played if of]
+                found = [[cells[cell].blocks[block] for cell in unit if block in cells[cell].blocks] for unit in units]
+                parts = [np.concatenate(of, axis=1) for of in found if of]
                 row.append(f"{mean_over_cells(parts):z.1f}" if parts else "–")
             body.append(row)
     return markdown_table(["model", "tracks", "M", "P", *EPISODE_BLOCKS], body, right=len(EPISODE_BLOCKS))
@@ -227,7 +242,10 @@ def _controlled_cells(cells: AgentReturns, scales: CellScales) -> dict[str, list
 
 
 def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, str]:
-    """Return agent -> text with its score N on each track and the benefit M of its memory; a dash if missing."""
+    """Return agent -> text with its score N on each track and the benefit M of its memory; a dash if missing.
+
+    The text names the number of training runs if the numbers are means over several.
+    """
     scales, results, controls, found = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), stored.returns("cleared"), {}
     for agent in agents:
         cells, cleared, texts = results.get(agent, {}), controls.get(agent, {}), []
@@ -237,7 +255,7 @@ def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, s
         for where, on in ((PUBLISHED_TRACKS, "on tracks teammate and layout"), (PREFERENCE, "on track preference")):
             memory = block_difference(cells, cleared, _controlled_cells(cells, scales).get(where, ()), "all")
             texts.append(f"M {_format_interval(memory, 1, '+')} {on}")
-        found[agent] = ", ".join(texts)
+        found[agent] = ", ".join(texts) + _runs_text(cells)
     return found
 
 
@@ -280,9 +298,12 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
             score = find_score(cells, [cell for cell in scored if cell.layout == name], scales)
             text = f"{mean_over_cells(played):z.1f}" if played else "–"
             texts.append(f"{text} ({score.total.mean:z.2f})" if score else text)
-        score = find_score(cells, [cell for cell in scored if cell in cells], scales)
+        played = [cell for cell in scored if cell in cells]
+        score = find_score(cells, played, scales)
         worst = f"{score.worst[1]:z.2f}, {score.worst[0]}" if score else "–"
-        body.append([f"`{agent}`", *texts, worst, f"{score.regret:z.1f}" if score else "–"])
+        # The regret of an agent of one track is not comparable with that of others.
+        only = "" if played == scored else f" ({' and '.join({layout_track(cell.layout): 0 for cell in played})} only)"
+        body.append([f"`{agent}`", *texts, worst, f"{score.regret:z.1f}{only}" if score else "–"])
     return markdown_table(["model", *TEST_LAYOUTS, "worst teammate", "regret"], body, right=len(TEST_LAYOUTS) + 2)
 
 
@@ -352,12 +373,13 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
     }
     for axes, layout in zip(grid, layouts, strict=False):
         for number, agent in enumerate(shown):
-            color = f"C{number % 10}"
+            color, marker = f"C{number % 10}", ["", "o", "s", "^"][number // 10 % 4]
             for control, style in (("", "-"), ("cleared", "--")):
                 if (curve := curves.get((agent, control, layout))) is not None:
                     label = agent if not control else f"{agent}, memory cleared"
                     episodes, (mean,) = average_in_blocks(curve[None])
-                    axes.plot(episodes, mean, style, color=color, linewidth=1.2, label=label)
+                    look = {"color": color, "marker": marker, "markersize": 3, "linewidth": 1.2}
+                    axes.plot(episodes, mean, style, label=label, **look)
         stays = [egos["stay"] for cell, egos in headroom.items() if cell[0] == layout]
         axes.axhline(np.mean(stays), color="gray", linestyle=":", label="stay")
         if (best := mean_best_return(layout, scales)) is not None:

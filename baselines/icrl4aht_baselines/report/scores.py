@@ -304,12 +304,14 @@ def mean_return(cells: Iterable[CellReturns]) -> MeanInterval:
 def score_difference(
     one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], scales: CellScales
 ) -> MeanInterval:
-    """Return the score of one agent minus that of another, paired by task, seed and training run."""
-    parts = []
+    """Return the score of one agent minus that of another, paired by task and seed; training runs are not paired."""
+    parts, subtracted = [], 0
     for cell in cells:
-        first, second = (_gains_and_scales(of, scales[cell]) for of in common_results(one[cell], other[cell]))
-        parts.append((first[0] - second[0], *first[1:]))
-    return ratio_interval(_strata_by_layout(cells, parts))
+        both = common_results(one[cell], other[cell], ("tasks", "seeds"))
+        first, second = (_gains_and_scales(of, scales[cell]) for of in both)
+        parts.append((np.concatenate([first[0], second[0]]), *first[1:]))
+        subtracted = len(both[1].trainings)
+    return ratio_interval(_strata_by_layout(cells, parts), subtracted=subtracted)
 
 
 def block_difference(
@@ -338,16 +340,26 @@ def block_difference(
     return ratio_interval([[one] for one in _pooled_strata(common, parts).values()]) if parts else None
 
 
-def common_results(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:
-    """Return the results of two agents in one result cell, for the tasks, seeds and training runs that both have."""
+_AXES = ("trainings", "tasks", "seeds")
+
+
+def common_results(
+    one: CellReturns, other: CellReturns, paired: Sequence[str] = _AXES
+) -> tuple[CellReturns, CellReturns]:
+    """Return the results of two agents in one result cell, for those tasks, seeds and training runs that both have.
+
+    Args:
+        one, other: results of the agents.
+        paired: names of the fields whose values are compared; of other fields, all values are kept.
+    """
     common: dict[str, Any] = {
-        axis: tuple(key for key in getattr(one, axis) if key in getattr(other, axis))
-        for axis in ("trainings", "tasks", "seeds")
+        axis: tuple(key for key in getattr(one, axis) if key in getattr(other, axis)) for axis in paired
     }
 
     def select_common(of: CellReturns) -> CellReturns:
-        places = np.ix_(*([getattr(of, axis).index(key) for key in keys] for axis, keys in common.items()))
-        return of._replace(blocks={name: values[places] for name, values in of.blocks.items()}, **common)
+        kept = {axis: common.get(axis, getattr(of, axis)) for axis in _AXES}
+        places = np.ix_(*([getattr(of, axis).index(key) for key in keys] for axis, keys in kept.items()))
+        return of._replace(blocks={name: values[places] for name, values in of.blocks.items()}, **kept)
 
     return select_common(one), select_common(other)
 

@@ -1,10 +1,15 @@
 """Means and ratios with 95 % intervals, p-values, and the correction of p-values.
 
-Intervals are studentized bootstrap intervals (Efron and Tibshirani 1993, ch. 12.5). With five teammates, percentile
-intervals would be too narrow by a tenth, since the variance of resamples is (n - 1) / n of the true variance; dividing
-by the standard error of each resample corrects this. Teammates' behaviours are resampled within a combination of layout
-and family, or the seeds if fewer than three behaviours have headroom. Training runs are resampled for all combinations
-together. The random generator has a fixed seed, so that results are reproducible.
+Intervals of one training run are studentized bootstrap intervals (Efron and Tibshirani 1993, ch. 12.5). With five
+teammates, percentile intervals would be too narrow by a tenth, since the variance of resamples is (n - 1) / n of the
+true variance; dividing by the standard error of each resample corrects this. Teammates' behaviours are resampled within
+a combination of layout and family, or the seeds if fewer than three behaviours have headroom. The random generator has
+a fixed seed, so that results are reproducible.
+
+Intervals of several training runs are Student's t intervals, with the sum of the variances of behaviours and of
+training runs, and Satterthwaite's degrees of freedom: a bootstrap of three runs would often draw one run three times.
+They cover 95 % in simulations of three runs whose standard deviation is at most twice the behaviours' standard error.
+If it is four times as large, they cover 93 %; without an effect, 7 % of p-values are below 0.05, and 2 % below 0.005.
 
 Shapes: T training runs, U units of a stratum (behaviours, or seeds), S seeds, R resamples.
 """
@@ -16,7 +21,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import bootstrap, trim_mean
+from scipy.stats import bootstrap, t, trim_mean
 
 _RESAMPLES = 4000
 _LEAST_FREEDOM = 3  # with fewer degrees of freedom, too many resamples are equal
@@ -55,7 +60,8 @@ class Stratum(NamedTuple):
     """Group of units, such as teammates, that are resampled in the bootstrap of the ratio sum(gains) / sum(scales).
 
     Attributes:
-        gains: each unit's part of the numerator in each training run, of shape (T, U).
+        gains: each unit's part of the numerator in each training run, of shape (T, U). For a difference of two agents,
+            the training runs of the second agent follow those of the first.
         scales: each unit's part of the denominator, of shape (U,).
     """
 
@@ -85,8 +91,13 @@ def stratum_of_values(values: Float[np.ndarray, "T U ..."]) -> Stratum:
     return Stratum(units, np.ones(units.shape[1]))
 
 
-def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMPLES) -> MeanInterval:
+def ratio_interval(
+    groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMPLES, subtracted: int = 0
+) -> MeanInterval:
     """Return the mean over groups of the ratio sum(gains) / sum(scales), with its 95 % interval.
+
+    With `subtracted`, return the difference of this mean between two agents. Units are paired, and training runs are
+    not, because training runs of different agents have nothing in common.
 
     There is no interval if there are too few units: fewer than three degrees of freedom, or only one unit in most
     strata and at most three training runs.
@@ -94,25 +105,35 @@ def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMP
     Args:
         groups: strata of each group, at least one; all strata have the same training runs.
         resamples: number of resamples.
+        subtracted: number of training runs of the second agent.
     """
     strata = [[Stratum(gains[None], scales[None]) for gains, scales in group] for group in groups]
     trainings = groups[0][0].gains.shape[0]
-    (mean,), (variance,) = _estimate(strata, np.full((1, trainings), 1 / trainings))
-    freedom = sum(len(stratum.scales) - 1 for group in groups for stratum in group) + trainings - 1
+    runs = [trainings - subtracted, subtracted][: 1 + bool(subtracted)]
+    weights = np.repeat([1, -1][: len(runs)], runs) / np.repeat(runs, runs)
+    (mean,), parts = _estimate(strata, weights[None], runs)
+    variance = float(sum(part for (part,), _ in parts))
+    of_runs = sum(number - 1 for number in runs)
+    freedom = sum(len(stratum.scales) - 1 for group in groups for stratum in group) + of_runs
     several = [len(stratum.scales) > 1 for group in groups for stratum in group]
-    if freedom < _LEAST_FREEDOM or (trainings <= _LEAST_FREEDOM and np.mean(several) < 0.5):
+    if freedom < _LEAST_FREEDOM or (of_runs < _LEAST_FREEDOM and np.mean(several) < 0.5):
         return MeanInterval(float(mean))
     if variance < 1e-18:  # all units have the same ratio
         return MeanInterval(*[float(mean)] * 3, p=float(abs(mean) < 1e-9))
+    error = float(np.sqrt(variance))
+    if of_runs:
+        satterthwaite = variance**2 / sum(float(part) ** 2 / own_freedom for (part,), own_freedom in parts)
+        half = error * t.ppf(0.975, satterthwaite)
+        p = 2 * t.sf(abs(mean) / error, satterthwaite)
+        return MeanInterval(*map(float, (mean, mean - half, mean + half, p)))
     rng = np.random.default_rng(0)
-    drawn = rng.multinomial(trainings, np.full(trainings, 1 / trainings), size=resamples) / trainings
     resampled = [[_resample(stratum, resamples, rng) for stratum in group] for group in groups]
     with np.errstate(divide="ignore", invalid="ignore"):
-        means, variances = _estimate(resampled, drawn)
+        means, drawn_parts = _estimate(resampled, np.tile(weights, (resamples, 1)), runs)
+        variances = sum((part for part, _ in drawn_parts), np.zeros(resamples))
         variances[variances < 1e-9 * variance] = 0.0  # rounding errors; such resamples are left out
         studentized = (means - mean) / np.sqrt(variances)
     studentized = studentized[np.isfinite(studentized)]
-    error = float(np.sqrt(variance))
     low, high = mean - error * np.quantile(studentized, (0.975, 0.025))
     p = (1 + np.sum(np.abs(studentized) >= abs(mean) / error)) / (1 + len(studentized))
     return MeanInterval(float(mean), float(low), float(high), float(p))
@@ -124,17 +145,21 @@ def _resample(stratum: Stratum, resamples: int, rng: np.random.Generator) -> Str
     return Stratum(stratum.gains[:, units].swapaxes(0, 1), stratum.scales[units])
 
 
-def _estimate(groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R T"]) -> tuple[np.ndarray, np.ndarray]:
+def _estimate(
+    groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R T"], runs: Sequence[int]
+) -> tuple[np.ndarray, list[tuple[np.ndarray, int]]]:
     """Return mean and variance of the ratio sum(gains) / sum(scales), averaged over groups, for each resample.
 
     Args:
         groups: strata with gains of shape (R, T, U) and scales of shape (R, U).
-        weights: share of each training run in each resample, of shape (R, T).
+        weights: share of each training run in each resample, of shape (R, T); negative for the second agent.
+        runs: number of training runs of each agent.
 
     Returns:
-        The means and the variances, both of shape (R,).
+        The means of shape (R,), and the parts of the variances: an array of shape (R,) and the degrees of freedom for
+        each stratum with several units, and for each agent with several training runs.
     """
-    by_training, variance = np.zeros_like(weights), np.zeros(len(weights))
+    by_training, parts = np.zeros_like(weights), []
     for group in groups:
         scale = sum(stratum.scales.sum(axis=1) for stratum in group)
         ratios = sum(stratum.gains.sum(axis=2) for stratum in group) / np.reshape(scale, (-1, 1))
@@ -145,12 +170,14 @@ def _estimate(groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R
             if units > 1:
                 mean_gains = (gains * weights[..., None]).sum(axis=1)
                 influence = (mean_gains - ratio[:, None] * scales) / np.reshape(scale, (-1, 1))
-                variance += influence.var(axis=1, ddof=1) * units / len(groups) ** 2
-    mean, trainings = (by_training * weights).sum(axis=1), weights.shape[1]
-    if trainings > 1:
-        deviations = (weights * (by_training - mean[:, None]) ** 2).sum(axis=1)
-        variance += deviations / (trainings - 1)
-    return mean, variance
+                parts.append((influence.var(axis=1, ddof=1) * units / len(groups) ** 2, units - 1))
+    for number, ratios, share in zip(
+        runs, np.split(by_training, runs[:1], axis=1), np.split(np.abs(weights), runs[:1], axis=1), strict=False
+    ):
+        if number > 1:
+            own_mean = (ratios * share).sum(axis=1, keepdims=True)
+            parts.append(((share * (ratios - own_mean) ** 2).sum(axis=1) / (number - 1), number - 1))
+    return (by_training * weights).sum(axis=1), parts
 
 
 def interquartile_mean(*strata: Float[np.ndarray, " _"]) -> MeanInterval:

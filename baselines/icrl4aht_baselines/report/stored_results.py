@@ -7,12 +7,14 @@ from collections import defaultdict
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 import pandas as pd
 
 from icrl4aht_baselines.agents.egos import OTHER_WAYS
+from icrl4aht_baselines.evaluate.protocols import CONTROLS
 from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.report.results import (
     TABLE_COLUMNS,
@@ -26,7 +28,7 @@ from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts,
 from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, write_json
-from icrl4aht_data.utils.text import card_file
+from icrl4aht_data.utils.text import card_file, counted_noun
 
 CURVE_COLUMNS = ["agent", "protocol", "control", "layout", "episode", "return"]
 
@@ -118,19 +120,46 @@ def _check_update(stored: StoredResults, found: Submission, where: str) -> None:
 
 
 def _check_training_runs(table: pd.DataFrame, agent: str, where: str) -> None:
-    """Check that an agent has the same training runs on all layouts of a kind, and controls of these runs only."""
+    """Check that an agent has the same training runs on all layouts of a kind.
+
+    Controls must have all of these runs, because M and P are compared with the agent's main results. Results of another
+    play mode may have some of the runs.
+    """
     own = table[(table["agent"] == agent) & (table["protocol"] == SUBMITTED_PROTOCOL)]
     runs = {key: {*of["training"]} for key, of in own.groupby(["kind", "control", "layout"])}
     first: dict[tuple[Hashable, Hashable], set[int]] = {}
     for (kind, control, layout), trainings in runs.items():
         elsewhere = first.setdefault((kind, control), trainings)
         main = runs.get((kind, "", layout), trainings)
-        if trainings != elsewhere or not trainings <= main:
+        if trainings != elsewhere or not (trainings == main if control in CONTROLS else trainings <= main):
             expected = elsewhere if trainings != elsewhere else main
+            named = f" with control `{control}`" if control in CONTROLS else ""
             raise OptionError(
                 f"{where}: with the stored results, {agent} would have training runs {sorted(trainings)} on "
-                f"{layout}, but {sorted(expected)} in its other results; give results of the same runs"
+                f"{layout}{named}, but {sorted(expected)} in its other results; give results of the same runs"
             )
+
+
+def describe_removed(before: StoredResults, after: StoredResults, agent: str) -> list[str]:
+    """Return a line of text for each control and kind of tasks of which an agent has fewer results after an update."""
+
+    def runs(stored: StoredResults) -> dict[Any, set[tuple[int, str]]]:
+        table = stored.table[stored.table["agent"] == agent]
+        return {
+            key: {*zip(of["training"], of["layout"], strict=True)}
+            for key, of in table.groupby(["protocol", "kind", "control"])
+        }
+
+    kept, lines = runs(after), []
+    for (protocol, kind, control), had in runs(before).items():
+        if lost := had - kept.get((protocol, kind, control), set()):
+            numbers, layouts = ({*values} for values in zip(*lost, strict=True))
+            named = f"`{control}`, " if control else ""
+            lines.append(
+                f"{named}protocol {protocol}, {kind} tasks: training runs {', '.join(map(str, sorted(numbers)))} on "
+                f"{counted_noun(len(layouts), 'layout')}"
+            )
+    return lines
 
 
 def add_submission(stored: StoredResults, found: Submission, where: str = "submission") -> StoredResults:

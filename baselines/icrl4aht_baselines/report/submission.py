@@ -131,7 +131,8 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
 
     Args:
         folders: folders with results of one agent. Folders with the same tasks and play mode count as
-            training runs 0, 1 and so on. Controls of the agent's other play mode are left out.
+            training runs 0, 1 and so on. A play mode that is named in the results is the agent's own if the results
+            that name none have it too. Controls of the agent's other play mode are left out.
         facts: facts about the agent, for the page.
         agent: name of the agent in tables; by default the name in the results.
         update: see `Submission`.
@@ -144,18 +145,22 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
         raise OptionError(f"{twice[0]}: given more than once; give each folder once")
     counts: Counter[tuple[str, str]] = Counter()  # (play mode, task) -> number of training runs so far
     evaluations, tasks, names, training, way = [], set(), {}, 0, ""
+    main = {folder: read_results(folder) for folder in folders}
+    unnamed = [of[0].settings for of in main.values() if not _named_play_mode(of[0].settings)]
+    own = {bool(settings.get("details", {}).get("sampled")) for settings in unnamed}
     for folder in folders:
         for control in ("", *CONTROLS):
             source = folder / control
             if control and (way or not (source / RESULTS).is_dir()):
                 continue
-            results = read_results(source)
+            results = read_results(source) if control else main[folder]
             settings = results[0].settings
             if any(result.settings != settings for result in results):
                 raise OptionError(f"{source}: the results have different settings; evaluate all tasks again")
             if not control:  # controls in the same folder belong to the same training run
-                way = next((one for one in OTHER_WAYS if settings["agent"].endswith(f" ({one})")), "")
-                names[settings["agent"].removesuffix(f" ({way})")] = source
+                named = _named_play_mode(settings)
+                names[settings["agent"].removesuffix(f" ({named})")] = source
+                way = "" if own == {named == "sampled"} else named
                 training = max(counts[way, result.task_id] for result in results)
                 counts.update((way, result.task_id) for result in results)
             returns = {result.task_id: result.returns for result in results}
@@ -173,6 +178,11 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
     return _parse_submission(msgspec.json.encode(found), ", ".join(map(str, folders)))
 
 
+def _named_play_mode(settings: dict[str, Any]) -> str:
+    """Return the play mode that the agent's name in results ends with, see `OTHER_WAYS`, or an empty string."""
+    return next((way for way in OTHER_WAYS if settings["agent"].endswith(f" ({way})")), "")
+
+
 def check_submission(found: Submission, where: str) -> None:
     """Check that a submission is complete and comparable, and states the training data.
 
@@ -180,8 +190,8 @@ def check_submission(found: Submission, where: str) -> None:
         OptionError: if settings are missing, the agent's name is taken by another agent or cannot be shown in tables,
             the best responses have another version, the training data is not stated, protocol, seeds or episodes are
             not those of the page, the tasks are not exactly those of the tracks, two training runs have equal returns,
-            a control has a training run that the main results lack, or the control `swapped` has other teammates than
-            for all tasks of a track.
+            are the same run or act in different ways, a control has a training run that the main results lack, or the
+            control `swapped` has other teammates than for all tasks of a track.
     """
     for one in found.evaluations:
         try:
@@ -215,13 +225,15 @@ def check_submission(found: Submission, where: str) -> None:
         played[one.control, one.training] += one.returns.items()
     named = f"the {counted_noun(len(expected), 'test task')} of {' and '.join(found.tracks)}"
     runs, alike = {training for control, training in played if not control}, {}
+    _check_same_play(found, where)
     for (control, training), results in played.items():
         part = f"{where}: {control or found.agent}, training {training}"
         counts = Counter(task for task, _ in results)
         if wrong := sorted(task for task in {*counts, *expected} if counts[task] != (task in expected)):
             raise OptionError(
                 f"{part}: expected one result of each of {named} and no others, found {counts[wrong[0]]} of {wrong[0]} "
-                f"({counted_noun(len(wrong), 'wrong task')}); evaluate exactly these tasks, and give each folder once"
+                f"({counted_noun(len(wrong), 'wrong task')}); evaluate exactly these tasks, and give each folder once; "
+                f"submit tracks with different numbers of training runs separately"
             )
         same = alike.setdefault((control, json_hash(sorted(results))), training)
         if same != training:
@@ -233,6 +245,28 @@ def check_submission(found: Submission, where: str) -> None:
             f"{where}: expected results of the agent's own play, found only results of controls or of "
             f"greedy or sampled actions; also give the folder of the expected results, or --update if the page has them"
         )
+
+
+def _check_same_play(found: Submission, where: str) -> None:
+    """Check that all training runs act in the same way, and that no run is given twice."""
+    ways: dict[str, str] = {}
+    runs: dict[tuple[str, str, str], int] = {}  # (control, task, run) -> number of the training run
+    for one in found.evaluations:
+        details, part = one.settings.get("details", {}), f"{where}: {one.control or found.agent}"
+        way = f"acting {details.get('acting')}, {'sampled' if details.get('sampled') else 'greedy'} actions"
+        first = ways.setdefault(one.control, way)
+        if first != way:
+            raise OptionError(
+                f"{part}, training {one.training}: found {way}, but {first} in another training; evaluate all training "
+                f"runs in the same way, see --greedy, --sampled and --acting"
+            )
+        for task in one.returns if details.get("run") else ():
+            same = runs.setdefault((one.control, task, json_hash(details["run"])), one.training)
+            if same != one.training:
+                raise OptionError(
+                    f"{part}, training {one.training}: the same run {details['run']} as training {same}; give the "
+                    f"results of a training run once"
+                )
 
 
 def _check_name(found: Submission, where: str) -> None:

@@ -184,7 +184,9 @@ class HistoryOptions:
     held_out: Annotated[
         float,
         Meta(gt=0, lt=1),
-        Option("Share of the histories to hold out; also of the tasks, if no validation histories pass the filters."),
+        Option(
+            "Share of the histories to hold out; also of the teammates, if no validation histories pass the filters."
+        ),
     ] = 0.1
     channels: Annotated[
         Channels | None,

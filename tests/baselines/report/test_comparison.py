@@ -106,7 +106,7 @@ def test_p_values_are_corrected_over_all_effects(stored, invented_responses):
 def test_controls_table_has_memory_and_partner_controls_and_episode_blocks(stored, invented_responses):
     table = comparison.controls_table(stored.returns(), cell_scales("seeded"), effects(stored))
     high, low = agent_row(table, "high"), agent_row(table, "low")
-    assert high[1] == low[1] == "published"
+    assert high[1] == low[1] == "layout"
     assert high[2].startswith("**+15.5 (") and high[2].endswith(")**"), "19.5 + 2 - (5 + 1)"
     assert high[3] == "+0.0 (+0.0 to +0.0)" and high[4:] == ["12.0", "12.0", "22.0", "22.0"]
     assert low[2:] == ["–", "–", "0.0", "0.0", "10.0", "10.0"]
@@ -138,7 +138,8 @@ def test_layouts_table_has_reference_egos_and_returns_by_layout(stored, invented
     table = comparison.layouts_table(stored.returns(), cell_scales("seeded"))
     assert agent_row(table, "stay")[1:4] == ["12.8", "13.0", "12.7"] and "| best response | 12.8 | 18.0 |" in table
     low = agent_row(table, "low")
-    assert low[1] == "–" and low[8] == "9.5 (0.47)" and float(low[10]) == pytest.approx(26.0 - 9.5, abs=0.1)
+    assert low[1] == "–" and low[8] == "9.5 (0.47)" and low[10].endswith(" (layout only)")
+    assert float(low[10].split()[0]) == pytest.approx(26.0 - 9.5, abs=0.1)
     assert low[9].endswith("asymm_right H4"), "stay earns 40 there"
     none = comparison.layouts_table(stored.returns(), {})
     assert agent_row(none, "low")[7:] == ["9.5", "9.5", "–", "–"] and "| best response | – |" in none

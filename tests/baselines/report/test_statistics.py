@@ -15,7 +15,7 @@ from icrl4aht_baselines.report.statistics import (
     ratio_interval,
     stratum_of_values,
 )
-from scipy.stats import ttest_1samp
+from scipy.stats import ttest_1samp, ttest_ind
 
 
 def test_interval_and_p_value_of_normal_values_are_close_to_students_t():
@@ -61,6 +61,22 @@ def test_interval_of_a_ratio_is_wider_over_several_training_runs():
     assert found[1].high - found[1].low > found[0].high - found[0].low
 
 
+def test_difference_of_two_agents_has_the_variances_of_the_training_runs_of_both():
+    units, higher = np.arange(20.0)[None], np.random.default_rng(0).normal(1.0, 0.5, 20)
+    spread = np.concatenate([units - 2, units, units + 2])
+    equal, several, both = (
+        ratio_interval([[Stratum(np.concatenate([one, other]), np.ones(20))]], subtracted=len(other))
+        for one, other in ((units + higher, units), (spread + higher, units), (spread + higher, spread))
+    )
+    assert [equal.mean, several.mean, both.mean] == pytest.approx([higher.mean()] * 3)
+    welch: Any = ttest_ind([-1.0, 1.0, 3.0], [-2.0, 0.0, 2.0], equal_var=False)
+    low, high = welch.confidence_interval()
+    assert both.high - both.low == pytest.approx(high - low, rel=0.02), "the variance of units is small"
+    same: Any = ttest_ind([-2 + both.mean, both.mean, 2 + both.mean], [-2, 0, 2])
+    assert both.p == pytest.approx(same.pvalue, rel=0.02)
+    assert 10 * (equal.high - equal.low) < several.high - several.low
+
+
 def test_interquartile_mean_drops_a_quarter_of_values_at_each_end():
     found = interquartile_mean(np.array([-100.0, 0, 1, 2, 3, 4, 5, 900]))
     assert found.mean == 2.5 and found.low < 2.5 < found.high
@@ -86,7 +102,7 @@ def test_holm_corrects_p_values():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("trainings", [1, 5])
+@pytest.mark.parametrize("trainings", [1, 3, 5])
 def test_intervals_have_the_nominal_coverage(trainings):
     """Simulate four groups of five units with unequal variances, and an effect of each training run on all units."""
     rng, covered, rounds = np.random.default_rng(1), 0, 800
@@ -96,3 +112,14 @@ def test_intervals_have_the_nominal_coverage(trainings):
         found = ratio_interval([[stratum_of_values(cell)] for cell in cells], resamples=1000)
         covered += found.low <= 1.5 <= found.high
     assert 0.92 < covered / rounds < 0.98
+
+
+@pytest.mark.slow
+def test_small_p_values_are_about_as_frequent_as_stated_with_three_training_runs():
+    """Simulate runs whose standard deviation is a multiple of the standard error of the mean over 12 units."""
+    rng, rounds = np.random.default_rng(2), 3000
+    for ratio, stated in ((2, (0.05, 0.008)), (4, (0.07, 0.02))):
+        effects = rng.normal(0.0, ratio / np.sqrt(12), (rounds, 3, 1))
+        p = [ratio_interval([[Stratum(own + rng.normal(0.0, 1.0, 12), np.ones(12))]]).p for own in effects]
+        found = [np.mean(np.array(p) < level) for level in (0.05, 0.005)]
+        assert found[0] == pytest.approx(stated[0], abs=0.015) and found[1] == pytest.approx(stated[1], abs=0.007)

@@ -24,11 +24,12 @@ FACTS = AgentFacts("a rule", "none", "none")
 
 @pytest.fixture(scope="module")
 def submission_file(tmp_path_factory) -> Path:
-    """Write a submission of two training runs of an agent; the second run also has results with memory cleared."""
+    """Write a submission of two training runs of an agent, with results with memory cleared."""
     folder = tmp_path_factory.mktemp("submitted")
     write_results(folder / "one", "rule", CURVE)
     write_results(folder / "two", "rule", OTHER_CURVE, trained_on=[{"layout": "asymm_both", "family": "H1"}])
-    write_results(folder / "two" / "cleared", "rule (cleared)", [0.0] * 100, forget=True)
+    for run, value in (("one", 1.0), ("two", 0.0)):
+        write_results(folder / run / "cleared", "rule (cleared)", [value] * 100, forget=True)
     write_submission(folder / "rule.json", make_submission([folder / "one", folder / "two"], FACTS))
     return folder / "rule.json"
 
@@ -37,7 +38,7 @@ def test_submission_has_all_results_of_all_folders(submission_file):
     found = read_submission(submission_file)
     assert (found.agent, found.tracks, found.facts.about) == ("rule", ["layout"], "a rule")
     parts = [(one.control, one.training, len(one.returns)) for one in found.evaluations]
-    assert parts == [("", 0, 40), ("", 1, 40), ("cleared", 1, 40)]
+    assert parts == [("", 0, 40), ("cleared", 0, 40), ("", 1, 40), ("cleared", 1, 40)]
     assert next(iter(found.evaluations[0].returns.values())) == [CURVE] * 3
 
 
@@ -55,8 +56,8 @@ def rename_task(one: dict[str, Any], task: str, name: str) -> None:
 def name_only_control(content: dict[str, Any], model: str) -> None:
     """Give a submission the name of a bundled model that only its results with a control come from."""
     content["agent"] = model
-    (control,) = [one for one in content["evaluations"] if one["control"] == "cleared"]
-    control["settings"]["details"]["model"] = model
+    for control in (one for one in content["evaluations"] if one["control"] == "cleared"):
+        control["settings"]["details"]["model"] = model
 
 
 OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
@@ -83,8 +84,8 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: one["settings"].pop("agent"), "settings: Object missing required field `agent`"),
         (lambda c, one, task: one["settings"].update(details=None), r"settings: .*got `null` - at `\$\.details`"),
         (lambda c, one, task: one["settings"]["details"].update(model=[]), r"got `array` - at `\$\.details\.model`"),
-        (lambda c, one, task: c["evaluations"][1].update(returns=one["returns"]), "1: the same returns as training 0"),
-        (lambda c, one, task: c["evaluations"][2].update(training=2), "2: no results without `cleared` of this"),
+        (lambda c, one, task: c["evaluations"][2].update(returns=one["returns"]), "1: the same returns as training 0"),
+        (lambda c, one, task: c["evaluations"][3].update(training=2), "2: no results without `cleared` of this"),
         (lambda c, one, task: c.update(best_responses="99"), r"best responses '99', but this package has '0'"),
         (lambda c, one, task: one["settings"]["details"].clear(), "no declaration of the training data"),
         (lambda c, one, task: one["settings"]["protocol"].update(four_recipes=True), "'four_recipes': True"),
@@ -96,9 +97,11 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: one["settings"].update(seeds=[0, 1]), r"seeds \[0, 1\], expected \[0, 1, 2\]"),
         (lambda c, one, task: one["returns"][task].pop(), r"has 2 lists of \[100\] returns, expected 3 of 100"),
         (lambda c, one, task: one["settings"]["protocol"].update(name="published"), "protocol {'name': 'published'"),
-        (lambda c, one, task: c.update(evaluations=c["evaluations"][2:]), "found only results of controls"),
+        (lambda c, one, task: c.update(evaluations=c["evaluations"][3:]), "found only results of controls"),
         (lambda c, one, task: one["settings"]["details"].update(forget=True), "found control cleared, expected none"),
-        (lambda c, one, task: c["evaluations"][2]["settings"]["details"].clear(), "control none, expected cleared"),
+        (lambda c, one, task: c["evaluations"][3]["settings"]["details"].clear(), "control none, expected cleared"),
+        (lambda c, one, task: one["settings"]["details"].update(sampled=True), "greedy actions, but .* sampled"),
+        (lambda c, one, task: [e["settings"]["details"].update(run="x") for e in c["evaluations"]], "same run x as"),
         (lambda c, one, task: c["facts"].update(data=""), "Expected `str` of length >= 1 - at `\\$.facts.data`"),
     ],
 )  # fmt: skip
@@ -176,7 +179,7 @@ def test_submit_and_results_commands_write_file_and_page(submission_file, tmp_pa
     page = ["results", str(submission_file), str(tmp_path / "mine.json"), "--out", str(tmp_path / "page")]
     run_cli(*page)
     text = (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
-    assert "| `my rule` | none | none | 1.5 core-hours |" in text and "| `rule` † |" in text
+    assert "| `my rule` | none | none | 1.5 core-hours |" in text and "| `rule` † (2 runs) |" in text
     run_cli(*page, "--overwrite", "--store")
     assert list(stored_results.read_stored(tmp_path / "stored.json").agents) == ["rule", "my rule"]
     said = ["submit", folder, *said[:-1], "Rule", "--out", str(tmp_path / "again.json")]
@@ -195,6 +198,9 @@ def test_results_with_sampled_actions_are_added_to_an_agent(tmp_path):
         write_results(tmp_path / name, name, CURVE, sampled=name != "mine") for name in ("mine", "mine (sampled)")
     )
     write_results(drawn / "cleared", "mine (sampled) (cleared)", CURVE, sampled=True, forget=True)
+    other = write_results(tmp_path / "default", "mine", OTHER_CURVE, sampled=True)
+    runs = [(one.control, one.training) for one in make_submission([other, drawn], FACTS).evaluations]
+    assert runs == [("", 0), ("", 1), ("cleared", 1)], "the agent samples by default"
     both = make_submission([drawn, own], FACTS)
     assert (both.agent, [one.control for one in both.evaluations]) == ("mine", ["sampled", ""])
     stored = stored_results.add_submission(stored_results.StoredResults(), make_submission([own], FACTS))
@@ -218,3 +224,10 @@ def test_results_with_sampled_actions_are_added_to_an_agent(tmp_path):
         stored_results.add_submission(later, make_submission(two, FACTS, update=True), "mine.json")
     replaced = stored_results.add_submission(later, make_submission([own], FACTS, update=True))
     assert set(replaced.table["control"]) == {""}
+    removed = ["`sampled`, protocol seeded, test tasks: training runs 0 on 2 layouts"]
+    assert stored_results.describe_removed(later, replaced, "mine") == removed
+    with_control = make_submission([other, drawn], FACTS)
+    with pytest.raises(
+        OptionError, match=r"runs \[1\] on asymm_right with control `cleared`, but \[0, 1\] in its other"
+    ):
+        stored_results.add_submission(stored_results.StoredResults(), with_control)
