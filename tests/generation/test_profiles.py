@@ -262,7 +262,9 @@ def test_given_tasks_keep_their_recorded_sources(changed):
     profile = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\nlearners = 2\npresets ='))
     tasks = [work.task for work in profile.units() if work.learner == 0][:3]
     first, second, third = (task.task_id for task in tasks)
-    found = profile.units_of(tasks, {second: "noise", third: "ppo"})
+    with pytest.raises(OptionError, match=rf"task {first}: its source is unknown, and profile mine has several: ppo, n"):
+        profile.units_of(tasks, {second: "noise", third: "ppo"})
+    found = profile.units_of(tasks, {first: "ppo", second: "noise", third: "ppo"})
     assert [(work.task.task_id, work.source, work.learner) for work in found] == [
         (first, "ppo", 0),
         (first, "ppo", 1),
@@ -273,6 +275,7 @@ def test_given_tasks_keep_their_recorded_sources(changed):
     of_ppo = load_profile(changed("keep = 8", "keep = 7"))
     with pytest.raises(OptionError, match=rf"task {second}: the source is noise, but profile mine only has ppo: "):
         of_ppo.units_of(tasks, {second: "noise"})
+    assert {work.source for work in of_ppo.units_of(tasks, {})} == {"ppo"}
 
 
 LEARNED_ENTRY = {

@@ -264,14 +264,20 @@ class Profile:
 
         Args:
             tasks: tasks to generate.
-            sources: source by task id; other tasks have the profile's first source.
+            sources: source by task id; other tasks have the profile's source if it has only one.
 
         Raises:
-            OptionError: if the profile does not have a task's source.
+            OptionError: if the profile does not have a task's source, or the source of a task is not known.
         """
         units = []
         for task in tasks:
             source = sources.get(task.task_id, self.sources[0])
+            if task.task_id not in sources and len(self.sources) > 1:
+                raise OptionError(
+                    f"task {task.task_id}: its source is unknown, and profile {self.name} has several: "
+                    f"{', '.join(self.sources)}; give the file meta/tasks.jsonl of a release, which states the sources "
+                    f"of its tasks, or a profile with one source"
+                )
             if source not in self.sources:
                 raise OptionError(
                     f"task {task.task_id}: the source is {source}, but profile {self.name} only has "
