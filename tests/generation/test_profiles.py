@@ -262,7 +262,9 @@ def test_given_tasks_keep_their_recorded_sources(changed):
     profile = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\nlearners = 2\npresets ='))
     tasks = [work.task for work in profile.units() if work.learner == 0][:3]
     first, second, third = (task.task_id for task in tasks)
-    with pytest.raises(OptionError, match=rf"task {first}: its source is unknown, and profile mine has several: ppo, n"):
+    with pytest.raises(
+        OptionError, match=rf"task {first}: its source is unknown, and profile mine has several: ppo, n"
+    ):
         profile.units_of(tasks, {second: "noise", third: "ppo"})
     found = profile.units_of(tasks, {first: "ppo", second: "noise", third: "ppo"})
     assert [(work.task.task_id, work.source, work.learner) for work in found] == [

@@ -153,7 +153,8 @@ class JobBoard:
 
     def __init__(self, show: Callable[..., None], updates: Mapping[str, int]) -> None:
         self._show_bar, self._updates = show, dict(updates)
-        self._ended: set[str] = set()
+        self._finished: set[str] = set()
+        self._failed: set[str] = set()
         self._running: dict[str, tuple[int, float]] = {}
         self._show()
 
@@ -168,14 +169,16 @@ class JobBoard:
             if progress := job.progress():
                 self.show_running(job.name, *progress)
 
-    def show_ended(self, name: str) -> None:
-        """Show that a job is finished or has failed."""
+    def show_ended(self, name: str, failed: bool) -> None:
+        """Show that a job is finished or has failed. The updates of failed jobs no longer count."""
         self._running.pop(name, None)
-        self._ended.add(name)
+        (self._failed if failed else self._finished).add(name)
         self._show()
 
     def _show(self) -> None:
-        updates = sum(self._updates[name] for name in self._ended) + sum(done for done, _ in self._running.values())
+        updates = sum(self._updates[name] for name in self._finished) + sum(done for done, _ in self._running.values())
+        total = sum(number for name, number in self._updates.items() if name not in self._failed)
         speed = sum(speed for _, speed in self._running.values())
-        note = f"{len(self._ended)}/{len(self._updates)} jobs" + (f", {speed:,.0f} steps/s" if speed else "")
-        self._show_bar("all jobs", updates, sum(self._updates.values()), note)
+        notes = [f"{len(self._finished)}/{len(self._updates)} jobs"]
+        notes += [f"{len(self._failed)} failed"] * bool(self._failed) + [f"{speed:,.0f} steps/s"] * bool(speed)
+        self._show_bar("all jobs", updates, total, ", ".join(notes))

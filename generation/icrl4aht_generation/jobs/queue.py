@@ -135,7 +135,7 @@ def _run_all(jobs: Sequence[Job], board: JobBoard, options: QueueOptions) -> Gen
                 if outcome.status == "busy":
                     busy.append(outcome.job)
                 else:
-                    board.show_ended(outcome.job.name)
+                    board.show_ended(outcome.job.name, outcome.status == "failed")
                 yield outcome
         jobs = busy
 

@@ -129,10 +129,12 @@ def test_job_board_shows_jobs_updates_and_speed():
     board = JobBoard(lambda *bar: shown.append(bar), {"one": 10, "two": 10})
     board.show_running("one", 5, 1_000.0)
     board.show_running("two", 2, 500.0)
-    board.show_ended("one")
+    board.show_ended("one", failed=False)
+    board.show_ended("two", failed=True)
     assert shown == [
         ("all jobs", 0, 20, "0/2 jobs"),
         ("all jobs", 5, 20, "0/2 jobs, 1,000 steps/s"),
         ("all jobs", 7, 20, "0/2 jobs, 1,500 steps/s"),
         ("all jobs", 12, 20, "1/2 jobs, 500 steps/s"),
+        ("all jobs", 10, 10, "1/2 jobs, 1 failed"),
     ]
