@@ -7,7 +7,8 @@
     OUT/NAME-TRACK-sSEED/first          run folder of the first of two training runs of a model
     OUT/NAME-TRACK-sSEED/own            histories that the model of the first run plays, labelled by the teacher
     OUT/NAME-TRACK-sSEED/mixed          these histories together with those that the first run learned from
-    OUT/NAME-TRACK-sSEED/results/KIND   results on validation tasks and on test tasks
+    OUT/NAME-TRACK-sSEED/results/KIND   results on validation tasks and on test tasks, see `EVALUATIONS`; in subfolders
+                                        `cleared` and `swapped` those of controls
 
 Finished parts are reused, and stopped parts resume.
 """
@@ -50,7 +51,7 @@ from icrl4aht_baselines.training.job import TrainingJob
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
 from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, KEPT_STEPS, TRACKS, layout_track
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, KEPT_STEPS, PREFERENCE, TRACKS, layout_track
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
@@ -68,13 +69,19 @@ OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
 OWN_SHARE = 0.5
 """Learning rate of a model's second training relative to that of the first."""
 
-EVALUATIONS = {
-    "validation": ("validation", "seeded", 1),
-    "diverse": ("diverse", "seeded", 1),
-    "test-seeded": ("test", "seeded", 3),
-    "test-published": ("test", "published", 1),
+_PUBLISHED = tuple(TRACKS)
+
+EVALUATIONS: dict[str, tuple[tuple[str, ...], str, str, int]] = {
+    "validation": (ALL_TRACKS, "validation", "seeded", 1),
+    "diverse": (_PUBLISHED, "diverse", "seeded", 1),
+    "test-seeded": (_PUBLISHED, "test", "seeded", 3),
+    "test-preference": ((PREFERENCE,), "test", "seeded", 3),
+    "test-published": (_PUBLISHED, "test", "published", 1),
 }
-"""Name of a folder of results -> split of the tasks, protocol, and number of seeds."""
+"""Name of a folder of results -> tracks and split of the tasks, protocol, and number of seeds. Tracks have separate
+folders of test results, because `submit` takes complete tracks."""
+
+_CONTROLLED = ("test-seeded", "test-preference")  # evaluations whose folders also have the results of controls
 
 TRACK_VIEWS: dict[str, dict[str, Any]] = {
     EVERY_TRACK: {},
@@ -339,12 +346,15 @@ class ReferenceJob(TrainingJob):
             combine_releases(mixed, [histories, own])
         return mixed
 
-    def evaluation_tasks(self, split: str) -> list[Task]:
-        """Return the tasks of a split that the model plays as a bundled model.
+    def evaluation_tasks(self, kind: str) -> list[Task]:
+        """Return the tasks of an evaluation that the model plays as a bundled model.
 
         A model of one track also plays those tasks of the track `preference` whose layouts belong to its track.
+
+        Args:
+            kind: a name in `EVALUATIONS`.
         """
-        tracks = tuple(TRACKS) if split == "diverse" else ALL_TRACKS
+        tracks, split, _, _ = EVALUATIONS[kind]
         tasks = [task for track in tracks for task in bundled_tasks(track, split)]
         return [task for task in tasks if self.track in (EVERY_TRACK, layout_track(task.layout.name))]
 
@@ -356,11 +366,11 @@ class ReferenceJob(TrainingJob):
         """Evaluate the trained model, with the function `show` for progress; on test tasks also with controls."""
         agent = find_agent(self.run_folder, greedy=self.reference.greedy)._replace(name=self.model)
         programs = ProgramCache()
-        for kind, (split, protocol, seeds) in EVALUATIONS.items():
-            for control in (None, *CONTROLS) if kind == "test-seeded" else (None,):
+        for kind, (_, _, protocol, seeds) in EVALUATIONS.items():
+            for control in (None, *CONTROLS) if kind in _CONTROLLED else (None,):
                 out, what = self.results(kind) / (control or ""), " ".join(filter(None, (self.name, kind, control)))
                 shown: Any = {"seeds": range(seeds), "show": show, "what": what, "programs": programs}
-                tasks = self.evaluation_tasks(split)
+                tasks = self.evaluation_tasks(kind)
                 evaluate_agent(agent, tasks, get_protocol(protocol), out, control=control, **shown)
 
 
@@ -372,7 +382,7 @@ def write_bundled_card(name: str, jobs: Sequence[ReferenceJob], folder: Path = M
         jobs: finished and evaluated jobs of the model, one for each track.
         folder: folder of the bundled models.
     """
-    (run,) = merge([read_run(job.results("test-seeded")) for job in jobs])
+    (run,) = merge([read_run(job.results(kind)) for job in jobs for kind in _CONTROLLED])
     validation = merge([read_run(job.results(kind)) for job in jobs for kind in ("validation", "diverse")])
     trained = [source for source in run.sources if source.trained]
     models = grouped(trained, lambda source: (source.trained or {})["run_hash"])  # the table has a row for each model

@@ -23,7 +23,7 @@ from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, PREFERENCE, TRACKS
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.writing.convert import to_release
@@ -93,9 +93,10 @@ def test_card_of_a_reference_model_shows_command_and_training_curves(tmp_path, m
     trained = {"config": config, "manifest_sha256": "ab12", "run_hash": "1"}
 
     def fake_run(folder: Path) -> EvaluationRun:
-        run = evaluated_run(
-            "ad-reference", ("cramped_down",) if "ad-reference-layout-s3" in folder.parts else ("demo_wide",)
+        layouts = (
+            ("cramped_down", "asymm_right") if "ad-reference-layout-s3" in folder.parts else ("demo_wide", "test_wide")
         )
+        run = evaluated_run("ad-reference", layouts[folder.name == "test-preference" :][:1])
         return dataclasses.replace(run, sources=(run.sources[0]._replace(trained=trained, folder=str(folder)),))
 
     monkeypatch.setattr(reference, "read_run", fake_run)
@@ -115,11 +116,13 @@ def test_card_of_a_reference_model_shows_command_and_training_curves(tmp_path, m
 
 def test_model_of_all_tracks_is_evaluated_on_all_tracks(tmp_path):
     job = ReferenceJob("rl2-adapting", EVERY_TRACK, 0, tmp_path)
-    assert {task.track for task in job.evaluation_tasks("test")} == {*ALL_TRACKS}
+    tests = [task for kind in ("test-seeded", "test-preference") for task in job.evaluation_tasks(kind)]
+    assert {task.track for task in tests} == {*ALL_TRACKS}
     assert {task.track for task in job.evaluation_tasks("diverse")} == {*TRACKS}
-    own = [ReferenceJob("x", track, 0, tmp_path).evaluation_tasks("test") for track in TRACKS]
-    assert {task.track for task in own[1]} == {"layout", PREFERENCE}
-    assert sum(map(len, own)) == len(job.evaluation_tasks("test")), "each task is played by one model"
+    own = [ReferenceJob("x", track, 0, tmp_path) for track in TRACKS]
+    assert {task.track for task in own[1].evaluation_tasks("test-seeded")} == {"layout"}
+    hidden = [task for one in own for task in one.evaluation_tasks("test-preference")]
+    assert len({task.task_id for task in hidden}) == len(hidden) == 120, "each is played by one model"
 
 
 def test_histories_of_teachers_with_equal_folder_names_are_recorded_separately(tmp_path, monkeypatch):

@@ -235,7 +235,8 @@ def check_conflicts(option: str, *others: str) -> None:
 
 
 def _flags(names: Iterable[str]) -> str:
-    return ", ".join("--" + name.replace("_", "-") for name in sorted(names))
+    flags = {parameter.name: parameter.opts[-1] for parameter in click.get_current_context().command.params}
+    return ", ".join(flags.get(name, "--" + name.replace("_", "-")) for name in sorted(names))
 
 
 process_options = topic(

@@ -68,7 +68,7 @@ class ModelOptions:
         OptionError: if a value is out of bounds.
     """
 
-    layers: Annotated[Count, Option("Layers of the transformer.")] = 4
+    layers: Annotated[Count, Option("Layers of the transformer; of bc, dense layers.")] = 4
     width: Annotated[Count, Option("Width of tokens and features.")] = 256
     heads: Annotated[Count, Option("Attention heads.")] = 4
     recurrent_layers: Annotated[Count, Option("GRU layers of Hybrid-AD, in place of the transformer.")] = 2

@@ -248,24 +248,31 @@ def check_submission(found: Submission, where: str) -> None:
 
 
 def _check_same_play(found: Submission, where: str) -> None:
-    """Check that all training runs act in the same way, and that no run is given twice."""
+    """Check that all training runs and their controls act in the same way, and that no run is given twice."""
     ways: dict[str, str] = {}
-    runs: dict[tuple[str, str, str], int] = {}  # (control, task, run) -> number of the training run
+    numbers: dict[tuple[str, str, str], int] = {}  # (control, task, run) -> number of the training run
+    runs: dict[tuple[int, str], Any] = {}  # (number of the training run, task) -> run, if not in another play mode
     for one in found.evaluations:
         details, part = one.settings.get("details", {}), f"{where}: {one.control or found.agent}"
+        part, mode = f"{part}, training {one.training}", one.control if one.control in OTHER_WAYS else ""
         way = f"acting {details.get('acting')}, {'sampled' if details.get('sampled') else 'greedy'} actions"
-        first = ways.setdefault(one.control, way)
+        first = ways.setdefault(mode, way)
         if first != way:
             raise OptionError(
-                f"{part}, training {one.training}: found {way}, but {first} in another training; evaluate all training "
-                f"runs in the same way, see --greedy, --sampled and --acting"
+                f"{part}: found {way}, but {first} in other results; evaluate all training runs and their controls in "
+                f"the same way, see --greedy, --sampled and --acting"
             )
-        for task in one.returns if details.get("run") else ():
-            same = runs.setdefault((one.control, task, json_hash(details["run"])), one.training)
+        run = details.get("run")
+        for task in one.returns if run else ():
+            same = numbers.setdefault((one.control, task, json_hash(run)), one.training)
             if same != one.training:
                 raise OptionError(
-                    f"{part}, training {one.training}: the same run {details['run']} as training {same}; give the "
-                    f"results of a training run once"
+                    f"{part}: the same run {run} as training {same}; give the results of a training run once"
+                )
+            if not mode and runs.setdefault((one.training, task), run) != run:
+                raise OptionError(
+                    f"{part}: run {run} in task {task}, but {runs[one.training, task]} in other results of this "
+                    f"training; give the folders that `evaluate --controls` wrote"
                 )
 
 

@@ -272,7 +272,7 @@ class Profile:
         units = []
         for task in tasks:
             source = sources.get(task.task_id, self.sources[0])
-            if task.task_id not in sources and len(self.sources) > 1:
+            if task.task_id not in sources and self.sources[1:]:
                 raise OptionError(
                     f"task {task.task_id}: its source is unknown, and profile {self.name} has several: "
                     f"{', '.join(self.sources)}; give the file meta/tasks.jsonl of a release, which states the sources "

@@ -54,15 +54,15 @@ def build_releases(
             TEAMMATES of a release.
         seed: seed of the suite.
         tasks: tasks to generate instead of the profile's tasks; no teammates are trained then.
-        sources: source of each given task by task id; by default the profile's first source.
+        sources: source of each given task by task id; by default the profile's source, if it has only one.
 
     Returns:
         The release folders.
 
     Raises:
         FailedJobsError: if a task failed; nothing is packed then.
-        OptionError: if `out` has files that this function does not write, if out/<kind> is not a release of this
-            profile, or if matplotlib is not installed.
+        OptionError: if the source of a given task is not known, if `out` has files that this function does not write,
+            if out/<kind> is not a release of this profile, or if matplotlib is not installed.
     """
     check_can_draw()  # fail before the long training if matplotlib is missing
     for kind in kinds:

@@ -116,10 +116,25 @@ def test_intervals_have_the_nominal_coverage(trainings):
 
 @pytest.mark.slow
 def test_small_p_values_are_about_as_frequent_as_stated_with_three_training_runs():
-    """Simulate runs whose standard deviation is a multiple of the standard error of the mean over 12 units."""
+    """Simulate runs whose standard deviation is a multiple of the standard error of the mean over 12 units.
+
+    Then the same for the difference of two agents with three runs and with one run.
+    """
     rng, rounds = np.random.default_rng(2), 3000
     for ratio, stated in ((2, (0.05, 0.008)), (4, (0.07, 0.02))):
         effects = rng.normal(0.0, ratio / np.sqrt(12), (rounds, 3, 1))
         p = [ratio_interval([[Stratum(own + rng.normal(0.0, 1.0, 12), np.ones(12))]]).p for own in effects]
         found = [np.mean(np.array(p) < level) for level in (0.05, 0.005)]
         assert found[0] == pytest.approx(stated[0], abs=0.015) and found[1] == pytest.approx(stated[1], abs=0.007)
+    effects = rng.normal(0.0, 2 / np.sqrt(12), (rounds, 4, 1))
+    units = [np.concatenate([rng.normal(0.0, 1.0, (1, 12))] * 3 + [np.zeros((1, 12))]) for _ in range(rounds)]
+    p = [ratio_interval([[Stratum(a + b, np.ones(12))]], subtracted=1).p for a, b in zip(effects, units, strict=True)]
+    assert np.mean(np.array(p) < 0.05) < 0.065
+
+
+def test_two_training_runs_have_an_interval_without_a_p_value():
+    gains = np.random.default_rng(0).normal(1.0, 1.0, (2, 12))
+    one = ratio_interval([[Stratum(gains, np.ones(12))]])
+    assert np.isfinite(one.low) and np.isnan(one.p)
+    both = ratio_interval([[Stratum(np.concatenate([gains, gains - 1]), np.ones(12))]], subtracted=2)
+    assert both.p < 0.2

@@ -102,6 +102,9 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: c["evaluations"][3]["settings"]["details"].clear(), "control none, expected cleared"),
         (lambda c, one, task: one["settings"]["details"].update(sampled=True), "greedy actions, but .* sampled"),
         (lambda c, one, task: [e["settings"]["details"].update(run="x") for e in c["evaluations"]], "same run x as"),
+        (lambda c, one, task: [e["settings"]["details"].update(run=e["control"] + "x") for e in c["evaluations"][:2]],
+         "cleared, training 0: run clearedx in task layout_test_.*, but x in other results of this training"),
+        (lambda c, one, task: c["evaluations"][1]["settings"]["details"].update(sampled=True), "sampled actions, but"),
         (lambda c, one, task: c["facts"].update(data=""), "Expected `str` of length >= 1 - at `\\$.facts.data`"),
     ],
 )  # fmt: skip
