@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_baselines import reference
 from icrl4aht_baselines.agents.egos import find_agent, with_channels
 from icrl4aht_baselines.agents.host import EgoInput, from_host
 from icrl4aht_baselines.evaluate.evaluator import evaluate
@@ -71,6 +72,7 @@ def test_model_is_evaluated_on_a_layout_without_training_data(trained_run, tmp_p
     assert np.shape(results[0].returns) == (1, 1)
     write_run_and_tasks(tmp_path, folder)
     monkeypatch.setattr(ReferenceJob, "results", lambda job, kind: tmp_path)
+    monkeypatch.setattr(reference, "_CONTROLLED", ("test-seeded",))  # the other folder would have the same results
     (tmp_path / "x-y").mkdir()
     card = write_bundled_card("x-y", [ReferenceJob("x-y", "layout", 0, folder)], tmp_path).read_text(encoding="utf-8")
     assert "| cramped_down | `" in card and ", manifest with SHA-256 `" in card
