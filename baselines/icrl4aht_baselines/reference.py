@@ -81,7 +81,7 @@ EVALUATIONS: dict[str, tuple[tuple[str, ...], str, str, int]] = {
 """Name of a folder of results -> tracks and split of the tasks, protocol, and number of seeds. Tracks have separate
 folders of test results, because `submit` takes complete tracks."""
 
-_CONTROLLED = ("test-seeded", "test-preference")  # evaluations whose folders also have the results of controls
+_CONTROLLED = ("test-seeded", "test-preference")  # evaluations that also play the controls
 
 TRACK_VIEWS: dict[str, dict[str, Any]] = {
     EVERY_TRACK: {},
@@ -349,7 +349,7 @@ class ReferenceJob(TrainingJob):
     def evaluation_tasks(self, kind: str) -> list[Task]:
         """Return the tasks of an evaluation that the model plays as a bundled model.
 
-        A model of one track also plays those tasks of the track `preference` whose layouts belong to its track.
+        A model of one track also plays the tasks of the track `preference` on layouts of its own track.
 
         Args:
             kind: a name in `EVALUATIONS`.
@@ -367,10 +367,10 @@ class ReferenceJob(TrainingJob):
         agent = find_agent(self.run_folder, greedy=self.reference.greedy)._replace(name=self.model)
         programs = ProgramCache()
         for kind, (_, _, protocol, seeds) in EVALUATIONS.items():
+            tasks = self.evaluation_tasks(kind)
             for control in (None, *CONTROLS) if kind in _CONTROLLED else (None,):
                 out, what = self.results(kind) / (control or ""), " ".join(filter(None, (self.name, kind, control)))
                 shown: Any = {"seeds": range(seeds), "show": show, "what": what, "programs": programs}
-                tasks = self.evaluation_tasks(kind)
                 evaluate_agent(agent, tasks, get_protocol(protocol), out, control=control, **shown)
 
 

@@ -197,6 +197,11 @@ def _runs_text(cells: AgentReturns) -> str:
     return f" ({', '.join(texts)})"
 
 
+def _tracks_of(cells: Iterable[ResultCell]) -> list[str]:
+    """Return the names of the published tracks that the cells' layouts belong to."""
+    return list(dict.fromkeys(layout_track(cell.layout) for cell in cells))
+
+
 def describe_differences(effects: SecondaryEffects) -> str:
     """Return a list item for each track with the differences of N between agents."""
     lines = []
@@ -221,8 +226,8 @@ def controls_table(results: Mapping[str, AgentReturns], scales: CellScales, effe
             if not units:
                 continue
             tested = (effects.get((control, where, agent)) for control in ("cleared", "swapped"))
-            tracks = {layout_track(cell.layout): None for cell in chosen}
-            played = where if where == PREFERENCE or tracks.keys() >= {*TRACKS} else ", ".join(tracks)
+            tracks = _tracks_of(chosen)
+            played = where if where == PREFERENCE or len(tracks) == len(TRACKS) else tracks[0]
             row = [f"`{agent}`", played, *(effect.text(1) if effect else "–" for effect in tested)]
             for block in EPISODE_BLOCKS:
                 found = [[cells[cell].blocks[block] for cell in unit if block in cells[cell].blocks] for unit in units]
@@ -302,7 +307,7 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
         score = find_score(cells, played, scales)
         worst = f"{score.worst[1]:z.2f}, {score.worst[0]}" if score else "–"
         # The regret of an agent of one track is not comparable with that of others.
-        only = "" if played == scored else f" ({' and '.join({layout_track(cell.layout): 0 for cell in played})} only)"
+        only = "" if played == scored else f" ({' and '.join(_tracks_of(played))} only)"
         body.append([f"`{agent}`", *texts, worst, f"{score.regret:z.1f}{only}" if score else "–"])
     return markdown_table(["model", *TEST_LAYOUTS, "worst teammate", "regret"], body, right=len(TEST_LAYOUTS) + 2)
 

@@ -350,7 +350,7 @@ def common_results(
 
     Args:
         one, other: results of the agents.
-        paired: names of the fields whose values are compared; of other fields, all values are kept.
+        paired: names of the fields in which only values that both agents have are kept; other fields keep all.
     """
     common: dict[str, Any] = {
         axis: tuple(key for key in getattr(one, axis) if key in getattr(other, axis)) for axis in paired

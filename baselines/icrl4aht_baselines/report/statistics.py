@@ -8,9 +8,9 @@ a fixed seed, so that results are reproducible.
 
 Intervals of several training runs are Student's t intervals, with the sum of the variances of behaviours and of
 training runs, and Satterthwaite's degrees of freedom: a bootstrap of three runs would often draw one run three times.
-They cover 95 % in simulations of three runs whose standard deviation is at most twice the behaviours' standard error.
-If it is four times as large, they cover 93 %; without an effect, 7 % of p-values are below 0.05, and 2 % below 0.005.
-With two runs they cover 89 to 95 %, and there is no p-value.
+In simulations of three runs, 95 % of the intervals contain the true mean if the standard deviation of the runs is at
+most twice the standard error over behaviours. If it is four times as large, 93 % contain it; then, if the true mean is
+0, 7 % of p-values are below 0.05, and 2 % below 0.005. With two runs 89 to 95 % contain it, and there is no p-value.
 
 Shapes: T training runs, U units of a stratum (behaviours, or seeds), S seeds, R resamples.
 """

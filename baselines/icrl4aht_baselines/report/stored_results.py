@@ -141,7 +141,13 @@ def _check_training_runs(table: pd.DataFrame, agent: str, where: str) -> None:
 
 
 def describe_removed(before: StoredResults, after: StoredResults, agent: str) -> list[str]:
-    """Return a line of text for each control and kind of tasks of which an agent has fewer results after an update."""
+    """Describe the stored results that an agent loses by an update, one line for each protocol, kind and control.
+
+    Args:
+        before: stored results before the update.
+        after: stored results after the update.
+        agent: name of the agent.
+    """
 
     def runs(stored: StoredResults) -> dict[Any, set[tuple[int, str]]]:
         table = stored.table[stored.table["agent"] == agent]

@@ -116,9 +116,9 @@ def test_intervals_have_the_nominal_coverage(trainings):
 
 @pytest.mark.slow
 def test_small_p_values_are_about_as_frequent_as_stated_with_three_training_runs():
-    """Simulate runs whose standard deviation is a multiple of the standard error of the mean over 12 units.
+    """Simulate training runs that differ by two and four times the standard error of the mean over 12 units.
 
-    Then the same for the difference of two agents with three runs and with one run.
+    The last simulation is of the difference between an agent with three runs and an agent with one run.
     """
     rng, rounds = np.random.default_rng(2), 3000
     for ratio, stated in ((2, (0.05, 0.008)), (4, (0.07, 0.02))):
