@@ -304,8 +304,7 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
     """Compare models on the benchmark's tasks.
 
     Compares the package's stored results with the results in each FILE that `submit` made. Writes a page with tables
-    and a figure (results.md and results.png), and all numbers (results.csv and results.parquet). No two agents may have
-    the same name.
+    and a figure (results.md and results.png), and all numbers (results.parquet). No two agents may have the same name.
     """
     from icrl4aht_baselines.report import comparison, stored_results
     from icrl4aht_baselines.report.submission import read_submission

@@ -43,7 +43,7 @@ from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_noun, fill_template, markdown_table
 
-RESULTS_FILES = ("results.md", "results.png", "results.csv", "results.parquet")
+RESULTS_FILES = ("results.md", "results.png", "results.parquet")
 
 _PANELS = 6
 _SIGNIFICANT = 0.05
@@ -77,21 +77,18 @@ PUBLISHED_TRACKS = "published"
 
 
 def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
-    """Write the page of results, its figure, and the table of results as CSV and Parquet. Return the paths.
+    """Write the page of results, its figure, and the table of results as a Parquet file. Return the paths.
 
     Raises:
         OptionError: if pyarrow or matplotlib is not installed.
     """
     import_pyarrow()
     folder.mkdir(parents=True, exist_ok=True)
-    text, figure, csv, parquet = paths = [folder / name for name in RESULTS_FILES]
+    text, figure, parquet = paths = [folder / name for name in RESULTS_FILES]
     text.write_text(render_comparison(stored), encoding="utf-8")
     plot_comparison(stored, figure)
-    table = add_scales(stored.table).round(3)
-    with atomic_write(csv) as partial:
-        table.to_csv(partial, index=False, lineterminator="\n")
     with atomic_write(parquet) as partial:
-        table.to_parquet(partial, index=False)
+        add_scales(stored.table).round(3).to_parquet(partial, index=False)
     return paths
 
 

@@ -280,7 +280,7 @@ def summary_lines(runs: Sequence[EvaluationRun]) -> list[str]:
 
 
 def csv_text(runs: Sequence[EvaluationRun]) -> str:
-    """Return the results of all runs as CSV text, with the columns of docs/results.csv, see `results`.
+    """Return the results of all runs as CSV text, with the columns of docs/results.parquet, see `results`.
 
     The column `agent` has the labels of the runs, because several runs may be of the same agent.
     """

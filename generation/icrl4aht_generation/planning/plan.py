@@ -57,8 +57,11 @@ ENVIRONMENT_STEPS_PER_SECOND = 180_000.0
 COMPILE_SECONDS = 30.0
 """Seconds to compile the functions of a task or a population on 2 CPU cores."""
 
-SCRIPTED_SECONDS = 1.0
-"""Seconds to write the scripted histories of a task, without compilation, which a family of teammates shares."""
+SCRIPTED_STEPS_PER_SECOND = 470_000.0
+"""Transitions of scripted histories per second on 2 CPU cores, including the release (from `teach` and `billion`)."""
+
+SCRIPTED_SECONDS = 0.75
+"""Additional seconds of each task with scripted histories, mostly compilation (from `teach` and `billion`)."""
 
 _GRADIENT = 3.1  # ratio of the times of a gradient step and a forward pass, measured with profiles `smoke` and `paper`
 
@@ -115,7 +118,7 @@ def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
     steps = sum(ego.updates * ego.steps_per_update for _, ego in egos)
     playing = [ego.updates * ego.steps_per_update * step_seconds(ego) for _, ego in egos]
     transitions = [config.histories * config.episodes * KEPT_STEPS for _, config in scripted]
-    scripted_seconds = [count / ENVIRONMENT_STEPS_PER_SECOND + SCRIPTED_SECONDS for count in transitions]
+    scripted_seconds = [count / SCRIPTED_STEPS_PER_SECOND + SCRIPTED_SECONDS for count in transitions]
     seconds = [played + COMPILE_SECONDS for played in playing] + scripted_seconds
     teammate_seconds = sum(run.steps * step_seconds(run.config) + COMPILE_SECONDS for run in runs)
     counts = {"transitions": kept.total(), "histories": histories.total(), "tasks": tasks}

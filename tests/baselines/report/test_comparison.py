@@ -166,7 +166,7 @@ def test_results_page_is_written_with_and_without_best_responses(stored, tmp_pat
     assert "| `high` | noise | oracle | 10 updates, 2 core-hours | – |" in text and "| `low`" not in text
     assert "`low`" not in text and "lists them (version 0)" in text
     assert paths[1].stat().st_size > 10_000
-    assert len(pd.read_parquet(paths[3])) == len(stored.table)
+    assert len(pd.read_parquet(paths[2])) == len(stored.table)
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: responses_folder / "measured.json")
     table = add_scales(stored.table)
     down = table[table["layout"] == "cramped_down"]

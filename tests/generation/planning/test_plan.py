@@ -53,10 +53,20 @@ def test_cost_of_noise_histories_includes_no_learners(tmp_path):
     assert (
         found["scripted_hours"]
         == found["hours_on_one"]
-        == pytest.approx(found["tasks"] * (transitions / 180_000 + 30) / 3600, abs=0.01)
+        == pytest.approx(found["tasks"] * (transitions / 470_000 + 0.75) / 3600, abs=0.01)
     )
     assert found["artefact_bytes"] == found["tasks"] * scripted_bytes(get_layout(profile.layouts[0]), profile.noise)
     assert "learners" not in dict(plan.cost_rows(found))
+
+
+@pytest.mark.parametrize(
+    ("profile", "hours", "size"), [("teach", 1057 / 3600, 447_144_160), ("billion", 2753 / 3600, 2_168_576_928)]
+)
+def test_plan_states_time_and_size_of_scripted_profiles_as_measured(profile, hours, size):
+    """The measured values are those of complete runs on two cores."""
+    found = plan.estimate_cost(load_profile(profile), devices=1)
+    assert found["hours_on_one"] == pytest.approx(hours, rel=0.05)
+    assert found["lite_bytes"] == pytest.approx(size, rel=0.05)
 
 
 def test_estimated_sizes_match_the_bundled_release():
