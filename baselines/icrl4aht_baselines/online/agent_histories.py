@@ -2,9 +2,9 @@
 
 The agent keeps its memory during a history, like during a task in an evaluation. The probability of a random action may
 fall over a history's episodes, as in noise distillation (Zisman et al. 2024). `expert_actions` are the agent's choices
-before the noise, or those of another trained agent that observes the same history, as in on-policy imitation (DAgger,
-Ross et al. 2011). `oracle_actions` are those of the scripted oracle. The teammate may change within a history, as under
-the protocol `swap`.
+before the noise, or those of another trained agent or of the script `search` in the same history, as in on-policy
+imitation (DAgger, Ross et al. 2011). `oracle_actions` are those of the scripted oracle. The teammate may change within
+a history, as under the protocol `swap`.
 
 Shapes: `B` histories that are played in parallel, `E` episodes, `T` steps of an episode, `S` bytes of a state record.
 """
@@ -25,8 +25,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from icrl4aht_generation.collection.curate import oracle_labels
+from icrl4aht_generation.collection.curate import oracle_labels, search_labels
 from icrl4aht_generation.collection.scripted_rollout import noise_schedules
+from icrl4aht_generation.experts.search import searcher
 from icrl4aht_generation.learners.resume import xla_threads
 from icrl4aht_generation.policy import Policy, randomize_action
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
@@ -154,18 +155,20 @@ def record_histories(
         config: number, length and noise of the histories.
         suite: folder of learned teammates, if tasks have any.
         played: function for progress, called with the number of episodes played since the last call.
-        make_labeller: function from a layout to another agent that labels the histories.
+        make_labeller: function from a layout to another agent that labels the histories; `searcher` for the script
+            `search`, which may label histories of any agent.
         swaps: task id -> changes of the teammate, see `plan_swaps`; by default the teammate never changes.
 
     Raises:
         OptionError: if an agent does not fit the layout, or the labeller takes other inputs than the agent.
     """
     chances = np.concatenate([noise_schedules(config, task.seed) for task in tasks])
-    seeds = range(config.histories)
+    seeds, searched = range(config.histories), make_labeller is searcher
 
     @cache  # all segments share one compiled program only if the agent is the same object
     def noisy_agent(layout: Layout) -> Policy:
-        return with_noise(make_ego(layout), KEPT_STEPS, None if make_labeller is None else make_labeller(layout))
+        own = None if make_labeller is None or searched else make_labeller(layout)
+        return with_noise(make_ego(layout), KEPT_STEPS, own)
 
     every = next((one.every for one in swaps.values()), None)
     protocol = replace(get_protocol("seeded", config.episodes), swap_every=every)
@@ -184,7 +187,10 @@ def record_histories(
             record, end = np.asarray(one.record), np.asarray(one.end)[:, None]
             parts.append((record, actions[..., EGO], actions[..., TEAMMATE], rewards, labels, end))
             played(len(chances))
-    return RecordedHistories(*(np.concatenate(field, axis=1) for field in zip(*parts, strict=True)))
+    found = RecordedHistories(*(np.concatenate(field, axis=1) for field in zip(*parts, strict=True)))
+    if searched:
+        found = found._replace(expert_actions=search_labels(tasks[0].layout, found.state, found.actions))
+    return found
 
 
 def plan_swaps(tasks: Sequence[Task], episodes: int, every: int) -> dict[str, TeammateSwaps]:
@@ -309,7 +315,7 @@ def collect_release(
     views: dict[Layout, LabelView] = {}
     for layout in dict.fromkeys(task.layout for task in teammates.tasks):
         policy, other = agent.make(layout), None if labeller is None else labeller.make(layout)
-        with_noise(policy, KEPT_STEPS, other)
+        with_noise(policy, KEPT_STEPS, None if labeller is not None and labeller.make is searcher else other)
         views[layout] = (other or policy).label_view
     parts = out.with_name(f"{out.name}.parts")
     settings = {
@@ -331,7 +337,7 @@ def collect_release(
     by = f"{agent.name}, before the noise" if labeller is None else f"{labeller.name}, in histories of {agent.name}"
     new = []
     # A script reads the dish from the recipes of its layout, so the tasks of a group must have the same recipes.
-    scripted = any(one.make in SCRIPTED for one in (agent, labeller) if one)
+    scripted = agent.make in SCRIPTED
     for group, tasks in grouped(
         teammates.tasks, lambda task: (task.layout.name, task.teammate_kind, task.layout.recipes if scripted else ())
     ).items():

@@ -18,7 +18,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.oracle import oracle
-from icrl4aht_generation.experts.search import with_taken_action
+from icrl4aht_generation.experts.search import searcher, with_taken_action
 from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.policy import Policy
@@ -107,6 +107,21 @@ def oracle_labels(layout: Layout, states: np.ndarray, actions: np.ndarray) -> np
     return _by_step(_compiled_oracle_labels(layout)(_by_episode(states), _by_episode(actions)))
 
 
+def search_labels(layout: Layout, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Return the actions that the script `search` advises at every step of B histories of another ego, int8 (B, T).
+
+    The script remembers all earlier episodes of a history, and prefers to believe in a dish that the ego has begun.
+
+    Args:
+        layout: layout of the histories; its recipes have no effect.
+        states: state records of the histories, uint8 (B, T, S).
+        actions: the ego's actions, int8 (B, T).
+    """
+    records, taken = (np.stack([_by_episode(one) for one in arrays], axis=2) for arrays in (states, actions))
+    labels = _compiled_search_labels(layout)(records.swapaxes(0, 1), taken.swapaxes(0, 1))
+    return np.moveaxis(np.asarray(labels), -1, 0).reshape(len(states), -1)
+
+
 def _by_episode(history: np.ndarray) -> jax.Array:
     """Reshape a history's array of shape (T, ...) to (100, E, ...), with the step within the episode as first axis."""
     return jnp.asarray(history.reshape(-1, KEPT_STEPS, *history.shape[1:]).swapaxes(0, 1))
@@ -142,6 +157,27 @@ def _compiled_oracle_labels(layout: Layout) -> Callable[[jax.Array, jax.Array], 
     Its arguments are state records of shape (100, E, S) and the actions that the ego took, of shape (100, E).
     """
     return jax.jit(lambda records, taken: follow_script(oracle(layout), layout, records, taken)[0].astype(jnp.int8))
+
+
+@lru_cache(maxsize=8)
+def _compiled_search_labels(layout: Layout) -> Callable[[np.ndarray, np.ndarray], jax.Array]:
+    """Return a compiled function that computes the advice of `search` in E episodes of 100 steps of B histories.
+
+    Its arguments are state records of shape (E, 100, B, S) and the actions that the ego took, of shape (E, 100, B).
+    """
+    script = searcher(layout, advises=True)
+
+    @jax.jit
+    def advice(records: jax.Array, taken: jax.Array) -> jax.Array:
+        def episode(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+            wanted, memory = follow_script(script, layout, *now, None, memory)
+            return memory, wanted.astype(jnp.int8)
+
+        keys = jax.random.split(jax.random.key(0), taken.shape[-1])
+        start = jax.vmap(script.init, in_axes=(None, 0))(script.params, keys)
+        return jax.lax.scan(episode, start, (records, taken))[1]
+
+    return advice
 
 
 def follow_script(

@@ -134,6 +134,20 @@ def test_histories_can_be_labelled_by_another_agent(dataset):
         agent_histories.with_noise(idle_agent(None), 10, AGENTS["oracle"](tasks[0].layout))
 
 
+@pytest.mark.slow
+def test_search_labels_histories_and_remembers_which_dish_was_rewarded():
+    """Without noise, the script `search` agrees with its own play as soon as a dish was rewarded."""
+    tasks = release_teammates(load_icrl4aht(layout="rooms-0-46", source="search").filter(teammate_family="H3")).tasks
+    config = NoiseConfig(2, 10, start=(0.0, 0.0))
+    found = agent_histories.record_histories(AGENTS["search"], tasks[:1], config, make_labeller=AGENTS["search"])
+    returns, agrees = found.rewards.reshape(2, 10, 100).sum(axis=-1), found.actions == found.expert_actions
+    for own, agree in zip(returns, agrees.reshape(2, 10, 100), strict=True):
+        first = int(np.argmax(own > 0))
+        assert own.max() == 40 and first < 5 and agree[first + 1 :].all()
+    other = agent_histories.record_histories(idle_agent, tasks[:1], config, make_labeller=AGENTS["search"])
+    assert (other.actions == STAY).all() and len(np.unique(other.expert_actions)) > 3
+
+
 def test_teammates_of_given_tasks_are_added_to_teammates_of_the_release(dataset):
     tasks = [task for track in TRACKS for task in read_tasks(manifest_path(track, "train", "diverse"))]
     plain, more = release_teammates(dataset), release_teammates(dataset, number=1, tasks=tasks)
