@@ -54,8 +54,8 @@ from icrl4aht_data.utils.text import counted_noun
 @click.option(
     "--labeller",
     type=shared.EGO_NAME,
-    help="Another agent, such as rl2-reference, whose most probable actions become the expert actions; or search, the "
-    "script that finds out a hidden dish.",
+    help="Another agent whose most probable actions become the expert actions, such as rl2-reference, or the script "
+    "search for tasks with a hidden dish.",
 )
 @click.option(
     "--swap",

@@ -315,7 +315,8 @@ def collect_release(
     views: dict[Layout, LabelView] = {}
     for layout in dict.fromkeys(task.layout for task in teammates.tasks):
         policy, other = agent.make(layout), None if labeller is None else labeller.make(layout)
-        with_noise(policy, KEPT_STEPS, None if labeller is not None and labeller.make is searcher else other)
+        if labeller is None or labeller.make is not searcher:  # `search` labels the histories of any agent
+            with_noise(policy, KEPT_STEPS, other)
         views[layout] = (other or policy).label_view
     parts = out.with_name(f"{out.name}.parts")
     settings = {

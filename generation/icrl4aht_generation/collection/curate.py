@@ -117,9 +117,9 @@ def search_labels(layout: Layout, states: np.ndarray, actions: np.ndarray) -> np
         states: state records of the histories, uint8 (B, T, S).
         actions: the ego's actions, int8 (B, T).
     """
-    records, taken = (np.stack([_by_episode(one) for one in arrays], axis=2) for arrays in (states, actions))
-    labels = _compiled_search_labels(layout)(records.swapaxes(0, 1), taken.swapaxes(0, 1))
-    return np.moveaxis(np.asarray(labels), -1, 0).reshape(len(states), -1)
+    of_episodes = (x.reshape(len(x), -1, KEPT_STEPS, *x.shape[2:]) for x in (states, actions))
+    labels = _compiled_search_labels(layout)(*(np.moveaxis(x, 0, 2) for x in of_episodes))
+    return np.moveaxis(np.asarray(labels), 2, 0).reshape(actions.shape)
 
 
 def _by_episode(history: np.ndarray) -> jax.Array:
