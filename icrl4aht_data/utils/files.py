@@ -111,7 +111,7 @@ def parse_json(text: str) -> Any:
     """
     try:
         value = json.loads(text)
-    except (ValueError, RecursionError) as error:  # also raised for too many digits or levels
+    except (ValueError, RecursionError) as error:  # also for a number with too many digits, or deep nesting
         raise IndexFormatError(f"not JSON: {error}") from error
     level = [value]
     for _ in range(_DEPTH):

@@ -316,7 +316,7 @@ def make_players(tasks: Sequence[PlayTask], method: Method, play: PlayOptions, m
         shared = (mate.init, mate.act) if mate.sees == "situation" else (task.layout,)
         return (task.family, task.searched, *shared)
 
-    # All players have the same filter, because the learner joins their episodes.
+    # All players leave out the same entries of observations, because the learner concatenates their episodes.
     changes = mirror or any(task.hidden for task in tasks)
     compact = _observation_filter(method, {task.layout for task in tasks}, changes)
     return [_Player(own, method, play, mirror, compact) for own in grouped(tasks, program).values()]

@@ -280,7 +280,8 @@ def mean_best_return(layout: str, scales: CellScales) -> float | None:
 def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return table 3: mean return on each layout, with the score N in parentheses, worst teammate, and regret.
 
-    The first rows show `stay`, the oracle, the best responses, and the mean range of equal training runs' returns.
+    The first rows show `stay`, the oracle, the best responses, and how far the returns of a best response's training
+    runs with equal settings lie apart (highest minus lowest, mean).
     """
     scored, headroom = cells_with_headroom(scales), read_reference_returns(SUBMITTED_PROTOCOL)
     body = []

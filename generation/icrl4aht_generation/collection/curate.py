@@ -161,7 +161,7 @@ def _compiled_oracle_labels(layout: Layout) -> Callable[[jax.Array, jax.Array], 
 
 @lru_cache(maxsize=8)
 def _compiled_search_labels(layout: Layout) -> Callable[[np.ndarray, np.ndarray], jax.Array]:
-    """Return a compiled function that computes the advice of `search` in E episodes of 100 steps of B histories.
+    """Return a compiled function that computes the labels by `search` of B histories with E episodes of 100 steps.
 
     Its arguments are state records of shape (E, 100, B, S) and the actions that the ego took, of shape (E, 100, B).
     """

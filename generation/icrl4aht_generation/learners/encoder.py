@@ -107,7 +107,7 @@ class CompactView:
         return self.words.entries(self.agents)
 
     def __call__(self, record: UInt8[Array, "*B S"], layout_number: Array | None = None) -> Seen:
-        """Return the encoder's input; `layout_number` is needed for several layouts, see `CellWords.ids`."""
+        """Return the encoder's input for state records; several layouts need `layout_number`, see `CellWords.ids`."""
         batch = record.shape[:-1]
         if self.kind == "words":
             return WordWindow(self.words.ids(record, layout_number))
