@@ -35,14 +35,14 @@ def canonical_positions(layout: Layout) -> np.ndarray:
     """Return the positions of a layout's own channels in `CANONICAL_CHANNELS`, ascending, as int64 of shape (C,).
 
     Raises:
-        OptionError: if the layout has an ingredient that no published layout has, and so no canonical channel.
+        OptionError: if an ingredient has no canonical channel, because no published layout uses it.
     """
     names = channel_names(layout)
     missing = [name for name in names if name not in CANONICAL_CHANNELS]
     if missing:
         raise OptionError(
             f"layout {layout.name}: channels {missing} are not among the {len(CANONICAL_CHANNELS)} canonical channels: "
-            f'use channels="own", or use ingredients that the published layouts have'
+            f"use own channels, or ingredients with ids below {CANONICAL_TYPES}, which the published layouts have"
         )
     positions = np.array([CANONICAL_CHANNELS.index(name) for name in names])
     positions.flags.writeable = False  # the cached array is shared by all callers

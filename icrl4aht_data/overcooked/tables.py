@@ -156,8 +156,8 @@ def stack_tables(layouts: Sequence[Layout]) -> Tables:
     without = [layout.name for layout in layouts if layout.ingredient_types > CANONICAL_TYPES]
     if 0 < len(without) < len(layouts):
         raise OptionError(
-            f"layouts {without} have ingredients without a canonical channel: stack these layouts separately from the "
-            f"others"
+            f"layouts {without} have ingredients without a canonical channel: evaluate or stack these layouts "
+            f"separately from the others"
         )
 
     return stack_padded(each, _PADDING)

@@ -1,4 +1,4 @@
-"""Write a release with histories of both sources (PPO and noise), two splits and both kinds of labels."""
+"""Write a release with PPO and noise histories, two splits, and expert and oracle labels."""
 
 from __future__ import annotations
 

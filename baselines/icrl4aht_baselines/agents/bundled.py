@@ -49,7 +49,7 @@ class BundledModel(NamedTuple):
         runs: name of a track -> run folder of the model for this track; a model for all tracks has the only key
             `EVERY_TRACK`.
         sampled: whether the model samples its actions by default, instead of taking the most probable ones.
-        role: purpose of the model, such as "best of AD".
+        role: purpose of the model, such as "plays best".
         date: day on which the model was bundled, such as "2026-11-24".
     """
 
@@ -80,7 +80,7 @@ def format_track(track: str) -> str:
 
 
 def describe_model(model: BundledModel) -> list[str]:
-    """Return one line of text for each track of a bundled model: method, size, and training data."""
+    """Return one line of text for each training run of a bundled model: method, size, and training data."""
     lines = []
     for track, folder in model.runs.items():
         trained = read_trained(folder)
@@ -116,7 +116,7 @@ def bundle_run(
         track: track of the tasks that the model plays, or `EVERY_TRACK`.
         folder: folder of the bundled models.
         sampled: whether the model samples its actions by default, on all tracks.
-        role: purpose of the model, such as "best of AD".
+        role: purpose of the model, such as "plays best".
 
     Raises:
         OptionError: if the name is invalid, the run is not finished, or its parameters are too large.

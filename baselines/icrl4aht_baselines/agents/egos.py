@@ -22,7 +22,7 @@ from icrl4aht_baselines.training.run_folder import CONFIG
 from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_data.errors import OptionError, UnknownNameError, check_choice, unknown_name
 from icrl4aht_data.overcooked.actions import ACTIONS, STAY
-from icrl4aht_data.overcooked.channels import Channels
+from icrl4aht_data.overcooked.channels import Channels, canonical_positions
 from icrl4aht_data.overcooked.layouts import Layout
 
 Acting = Literal["cached", "exact"]
@@ -37,7 +37,7 @@ so it is computed once for each episode with either value."""
 
 OTHER_WAYS = ("greedy", "sampled")
 """Ways of choosing actions, see `PlayMode.greedy`. Results that were not made in a model's default way name the way
-that was used, such as "ad-reference (sampled)"."""
+that was used, such as "ad-reference (greedy)"."""
 
 
 class PlayMode(NamedTuple):
@@ -58,7 +58,7 @@ class PlayMode(NamedTuple):
 
 
 AS_PUBLISHED = PlayMode()
-"""Default play mode of runs and of most bundled models."""
+"""Default play mode of runs. The package's bundled models sample their actions."""
 
 
 class NamedEgo(NamedTuple):
@@ -120,7 +120,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
         name: name of a reference ego or of a bundled model, or path of a run folder.
         acting: how a trained model computes its context, see `ACTING`; "cached" by default.
         greedy: True if a trained model takes its most probable action, False if it samples an action; by default True
-            for a run folder, and as in the stored results for a bundled model.
+            for a run folder, and as `BundledModel.sampled` says for a bundled model.
 
     Raises:
         UnknownNameError: if the name or the value of `acting` is unknown.
@@ -169,7 +169,7 @@ def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Lay
     """Return a function from a layout to the policy of a trained model.
 
     The function raises OptionError with the name of `folder` if the layout's observations do not have the shape that
-    the model was trained on. Models that take canonical channels play on every layout.
+    the model was trained on. Models that take canonical channels play on every layout whose ingredients have them.
     """
     policy = trained_policy(run.method, run.params, run.context, mode)
 
@@ -180,6 +180,11 @@ def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Lay
                 f"{layout.name} has {layout.obs_shape}; choose tasks on layouts with the same observation "
                 f"shape, or train with --channels canonical"
             )
+        if run.channels == "canonical":
+            try:
+                canonical_positions(layout)
+            except OptionError as error:
+                raise OptionError(f"{folder}: trained with canonical channels: {error}") from error
         return with_channels(policy, run.channels, layout.name in run.hide_recipe)
 
     return make_ego

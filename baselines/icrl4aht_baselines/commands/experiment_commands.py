@@ -188,6 +188,7 @@ def best_response_command(
     from icrl4aht_baselines.online.responses import (
         ResponseJob,
         find_behaviours,
+        initial_run,
         responses_table,
         tasks_with_headroom,
         write_responses,
@@ -199,6 +200,9 @@ def best_response_command(
     behaviours = find_behaviours(tasks)
     click.echo(f"{len(tasks)} tasks with headroom, {len(behaviours)} behaviours")
     settings = [ResponseOptions(**training, init=None if init == "oracle" else init) for init in inits]
+    for own in settings:  # reports a model that does not fit now, not in every job
+        for layout in {task.layout.name for task in tasks}:
+            initial_run(layout, own)
     jobs = [ResponseJob(one, seed, own, out) for seed in range(seeds) for own in settings for one in behaviours]
     return jobs, lambda folder: write_responses(jobs, folder, _model_returns()), responses_table
 

@@ -100,7 +100,7 @@ def collect_command(
 
     from icrl4aht_baselines.agents.egos import find_agent
     from icrl4aht_baselines.online.agent_histories import collect_release, plan_swaps, release_teammates
-    from icrl4aht_baselines.training.histories import filter_histories
+    from icrl4aht_baselines.training.histories import check_layouts, filter_histories
 
     start, end = noise
     config = NoiseConfig(histories, episodes, start=(start, start), end=(end, end))
@@ -108,6 +108,7 @@ def collect_command(
     other = find_agent(labeller, greedy=True) if labeller else None
     names = [get_layout(name).name for name in layouts] or None
     dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
+    check_layouts(dataset, names or ())
     tasks = [task for manifest in manifests for task in read_tasks_and_layouts(manifest)]
     teammates = release_teammates(dataset, number, tasks)
     if swap is not None and (alone := len(teammates.tasks) - len(plan_swaps(teammates.tasks, config.episodes, swap))):

@@ -56,7 +56,7 @@ greedy_option = click.option(
     "--greedy/--sampled",
     default=None,
     help="Take a trained model's most probable actions, or sample its actions.",
-    show_default="greedy; for a bundled model see `models`",
+    show_default="greedy; sampled for a bundled model",
 )
 _ONLY_LAYOUTS: Any = {"multiple": True, "help": "Only on this layout; repeat for several."}
 only_layouts_option = click.option("--layout", "layouts", type=LAYOUT, **_ONLY_LAYOUTS)
@@ -108,7 +108,7 @@ def chosen_tasks(
 
     Raises:
         UnknownNameError: if a layout is unknown.
-        EmptySelectionError: if no task has one of the chosen layouts and families.
+        EmptySelectionError: if one of the chosen layouts or families has no task.
         click.UsageError: if both a manifest and a split are given, because a manifest states the split of its tasks.
     """
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks
@@ -121,9 +121,12 @@ def chosen_tasks(
     names = {get_layout(name).name for name in layouts}
     chosen = [task for task in given if not names or task.layout.name in names]
     chosen = [task for task in chosen if not families or task.teammate_family in families]
-    if not chosen:
-        found = manifest or f"the tasks of split {' and '.join(split)}"
-        wanted = "".join(f" {word} {', '.join(sorted(of))}" for word, of in (("on", names), ("with", families)) if of)
+    # Tasks of some layouts or families only would be a smaller evaluation than the user asked for.
+    played = {task.layout.name for task in chosen} | {task.teammate_family for task in chosen}
+    missing = [(word, {*of} - played) for word, of in (("on", names), ("with", families))]
+    if not chosen or any(of for _, of in missing):
+        found = manifest or f"the tasks of split {' and '.join(split)}, track {' and '.join(track)}"
+        wanted = "".join(f" {word} {', '.join(sorted(of))}" for word, of in missing if of)
         raise EmptySelectionError(f"no task{wanted} in {found}: choose another --layout or --family, or leave them out")
     return chosen
 

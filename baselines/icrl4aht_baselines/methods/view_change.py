@@ -107,8 +107,8 @@ def no_change() -> ViewChange:
 def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> BatchView:
     """Return a function from a batch of state records to observations, possibly mirrored or with hidden indicators.
 
-    The layout number of a batch row is n + N * m, for layout n of N layouts and mirroring m: 0 for none, 1 for upside
-    down, 2 for sideways, 3 for both.
+    The layout number of a batch row is n + N * m, for layout n of N layouts and mirroring m: 0 for none, 1 for up-down,
+    2 for left-right, 3 for both.
 
     Args:
         layouts: the N layouts.

@@ -33,6 +33,7 @@ from icrl4aht_baselines.online.rl2 import PlayTask, PlayTrainer
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.job import TrainingJob
 from icrl4aht_baselines.training.options import PlayOptions, ResponseOptions
+from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_data.benchmark.best_responses import (
     BestResponse,
@@ -45,7 +46,7 @@ from icrl4aht_data.benchmark.best_responses import (
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LAYOUT_NAMES, LEAST_HEADROOM, PREFERENCE, TESTED_ON
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_reference_returns
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import unknown_name
+from icrl4aht_data.errors import OptionError, unknown_name
 from icrl4aht_data.utils.files import json_hash, parse_json, read_text, write_atomically
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_noun, markdown_table
@@ -211,12 +212,8 @@ class ResponseJob(EgoJob):
         "slope" is the training return in the last quarter of the steps minus that in the third quarter.
         """
         task, params = self.tasks[0], None
-        if self.options.init:
-            models = bundled_models()
-            if self.options.init not in models:
-                raise unknown_name("bundled model", self.options.init, models)
-            model = models[self.options.init]
-            params = read_trained(model.runs[model.run_key(task.layout.name)]).params
+        if run := initial_run(task.layout.name, self.options):
+            params = read_trained(run).params
         mate = build_teammate(task.layout, task.teammate)
         played = PlayTask(task.layout, task.teammate_kind, mate, False, task.layout.name)
         trainer, params = self.train([played] * self.options.tasks, on_update, params)
@@ -293,6 +290,32 @@ def _trained_ego(trainings: Collection[TrainingRun]) -> tuple[float, str]:
         longest = [one.mean_return for one in trainings if (one.steps, one.width) == (run.steps, run.width)]
         return float(np.mean(longest)), f"informed ego, {counted_noun(len(longest), 'run')}"
     return run.mean_return, f"best response, seed {run.seed}" + (f" from {run.init}" if run.init else "")
+
+
+def initial_run(layout: str, options: ResponseOptions) -> Path | None:
+    """Return the run folder of the bundled model that a training run on a layout starts from; None without a model.
+
+    Args:
+        layout: short name of the layout.
+        options: settings of the training run.
+
+    Raises:
+        UnknownNameError: if `options.init` is not the name of a bundled model.
+        OptionError: if the model has another width.
+    """
+    if not options.init:
+        return None
+    models = bundled_models()
+    if options.init not in models:
+        raise unknown_name("bundled model", options.init, models)
+    model = models[options.init]
+    run = model.runs[model.run_key(layout)]
+    width = read_config(run)["model"]["width"]
+    if width != options.width:
+        raise OptionError(
+            f"width = {options.width}: {options.init} has width {width}; choose --width {width}, or --init oracle"
+        )
+    return run
 
 
 def include_models(found: BestResponse, models: Mapping[str, Mapping[str, np.ndarray]]) -> BestResponse:

@@ -336,7 +336,7 @@ def read_submission(path: Path) -> Submission:
     """Read a submission from a file and check its content.
 
     Raises:
-        OptionError: if the file is not a submission, or for the reasons of `check_submission`.
+        OptionError: if the file is not a submission, or `check_submission` rejects it.
     """
     return _parse_submission(path.read_bytes(), str(path))
 

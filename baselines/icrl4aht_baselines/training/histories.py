@@ -21,19 +21,20 @@ from icrl4aht_baselines.methods.registry import PLAYING, get_method, overcooked_
 from icrl4aht_baselines.methods.tokens import BatchView, plain_view
 from icrl4aht_baselines.methods.view_change import changed_view, number_layouts
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, TrainOptions
-from icrl4aht_baselines.training.run_folder import CHECKPOINTS, read_config
+from icrl4aht_baselines.training.run_folder import CHECKPOINTS, other_version, read_config
 from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_data.dataset import Dataset, load_icrl4aht, teammate_ids, teammate_names
-from icrl4aht_data.errors import EmptySelectionError, OptionError
+from icrl4aht_data.errors import EmptySelectionError, OptionError, UnknownNameError
 from icrl4aht_data.fetch import Remote
 from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, read_layouts_file
 from icrl4aht_data.format.schema import MANIFEST
-from icrl4aht_data.overcooked.channels import Channels, observation_shape
+from icrl4aht_data.overcooked.channels import Channels, canonical_positions, observation_shape
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.splitting import choose_histories, choose_teammates
 from icrl4aht_data.utils.files import file_hash, json_hash
+from icrl4aht_data.utils.text import listed_names
 
 _CELL_FIELDS = {
     "layout": "layout",
@@ -140,6 +141,7 @@ def _load_histories(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]
     release = load_icrl4aht(histories.root, obs="uint8")  # the release may define layouts, so it is opened first
     names = None if every else [get_layout(name).name for name in histories.layouts]
     found = filter_histories(release.filter(split="train", layout=names), histories.filters)
+    check_layouts(found, names or ())
     differ = len({layout.obs_shape for layout in found.layouts}) > 1
     channels = histories.channels or ("canonical" if every or differ else "own")
     if channels == "own" and differ:
@@ -148,6 +150,8 @@ def _load_histories(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]
             f"numbers of own channels: leave out --channels or choose canonical, or train on one layout, such as "
             f"--layout {found.layouts[0].name}"
         )
+    for layout in found.layouts if channels == "canonical" else ():
+        canonical_positions(layout)  # reports a layout without them before the run folder is made
     options: Any = {"obs": "state" if found.has_states else None, "channels": channels}
     validation = None
     with suppress(EmptySelectionError):
@@ -167,6 +171,20 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, Any]) -> Dataset:
         for value in values:  # a value that occurs in no history is an error, even if other values occur
             dataset.filter(**{name: value})
     return dataset.filter(**filters)
+
+
+def check_layouts(dataset: Dataset, names: Iterable[str]) -> None:
+    """Check that a selection has histories on each of these layouts, given by their names.
+
+    Raises:
+        EmptySelectionError: if it has no history on one of them.
+    """
+    known = [layout.name for layout in dataset.layouts]
+    if missing := [name for name in names if name not in known]:
+        raise EmptySelectionError(
+            f"{dataset.root}: no chosen history is on {', '.join(missing)}, only on {listed_names(known)}; leave out "
+            f"{', '.join(missing)}, or choose another source or release"
+        )
 
 
 def training_record(dataset: Dataset, labels: Labels | None = None) -> list[dict[str, Any]]:
@@ -239,6 +257,11 @@ def _sampler(
                     f"{name} = {value}: {method.name} draws tasks and contexts, and only windows can be drawn so; "
                     f"leave out --{name.replace('_', '-')}"
                 )
+        if histories.queries > options.context + 1:
+            raise OptionError(
+                f"queries = {histories.queries}: a context of {options.context} transitions has "
+                f"{options.context + 1} prefixes with a query each; choose at most {options.context + 1} queries"
+            )
         return dataset.dpt(context=options.context, order=histories.order, queries=histories.queries, **shared)
     if histories.queries > 1:
         raise OptionError(
@@ -362,7 +385,10 @@ def load_initial_params(run: Path, method: Method, about: dict[str, Any]) -> Any
     if jax.tree.map(jnp.shape, before.params) != jax.tree.map(jnp.shape, shapes) or differ.keys() & _MEANINGS:
         listed = "; ".join(f"{k} = {a!r}, not {b!r}" for k, (a, b) in differ.items())
         raise OptionError(f"{run}: trained with other options ({listed}); give these options, or another run")
-    about["init"] = {"run": before.hash, "step": before.step}
+    release = {name: config["histories"][name] for name in ("data_version", "manifest_sha256")}
+    earlier = {"init": config["init"]} if "init" in config else {}
+    versions = {"package_version": config["package_version"], **release}
+    about["init"] = {"run": before.hash, "step": before.step, **versions, **earlier}
     about[TRAINED_ON] = [*about[TRAINED_ON], *(cell for cell in before.trained_on if cell not in about[TRAINED_ON])]
     return before.params
 
@@ -387,16 +413,19 @@ def read_trained(folder: Path) -> TrainedModel:
         world = overcooked_world(layouts, model.encoder, canonical=channels == "canonical")
         method = get_method(config["method"])(model, world)
         context, cells = train["context"], config[TRAINED_ON]
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, AttributeError, IndexError, UnknownNameError) as error:
         raise OptionError(
-            f"{folder}: its config.json does not describe a run on learning histories: {error!r}"
+            f"{folder}: its config.json does not describe a run on learning histories: {error!r}{other_version(config)}"
         ) from error
     if expected != obs_shape:
         raise OptionError(
             f"{folder}: trained on observations of shape {obs_shape}, but {layouts[0].name} with {channels} channels "
-            f"has observations of shape {expected} in this version; train again"
+            f"has observations of shape {expected} in this version; train again{other_version(config)}"
         )
-    params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
+    try:
+        params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
+    except OptionError as error:
+        raise OptionError(f"{error}{other_version(config)}") from error
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
     label += "+mlp" if model.encoder == "mlp" else ""  # encoders `words` and `paper` compute the same features
     names, digest = tuple(layout.name for layout in layouts), json_hash(config)

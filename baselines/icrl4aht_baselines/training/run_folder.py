@@ -44,13 +44,18 @@ def read_config(folder: Path) -> dict[str, Any]:
     except (IndexFormatError, KeyError, TypeError) as error:
         raise OptionError(f"{folder}: not a run: expected {CONFIG} with run_format ({error})") from error
     if found != RUN_FORMAT:
-        writer, reader = config.get("package_version"), format_versions()["package_version"]
-        other = f", or use this run with version {writer} of this package, which wrote it" if writer != reader else ""
+        reader = format_versions()["package_version"]
         raise OptionError(
             f"{path}: run_format {found!r}, but version {reader} of this package reads run_format {RUN_FORMAT} only: "
-            f"train again into another folder (another --out){other}"
+            f"train again into another folder (another --out){other_version(config)}"
         )
     return config
+
+
+def other_version(config: dict[str, Any]) -> str:
+    """Return the end of a message about a run: the version that wrote it, if this package has another version."""
+    writer, reader = config.get("package_version"), format_versions()["package_version"]
+    return f", or use this run with version {writer} of this package, which wrote it" if writer != reader else ""
 
 
 def check_same_settings(found: dict[str, Any], expected: dict[str, Any], what: str) -> None:

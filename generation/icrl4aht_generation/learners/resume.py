@@ -231,7 +231,9 @@ class StateFile:
         return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
     def _invalid_state_error(self, problem: str) -> OptionError:
-        return OptionError(f"{self.path}: not a state of this training: {problem}; remove the file to start again")
+        return OptionError(
+            f"{self.path}: not a state of this training: {problem}; restore the file, or remove it to start again"
+        )
 
 
 class Checkpoints:

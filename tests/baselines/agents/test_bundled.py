@@ -21,7 +21,7 @@ from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from PIL import Image
 
 from icrl4aht_data.errors import OptionError, UnknownNameError
-from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from tests.helpers.commands import run_cli
 
 MODEL = ModelOptions(layers=1, width=8, heads=2, encoder="mlp")
@@ -83,6 +83,9 @@ def test_model_of_all_tracks_plays_every_layout_and_replaces_models_of_one_track
     agent, trained = find_agent("ad-tiny"), read_trained(folder)
     assert agent.details and (agent.details["run"], agent.details["trained_on"]) == (trained.hash, trained.trained_on)
     assert {agent.make(get_layout(name)).sees for name in ("demo_wide", "cramped_down")} == {"canonical_input"}
+    strange = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),))
+    with pytest.raises(OptionError, match=r"ad-tiny/all: trained with canonical channels: layout mine: .* ids below 4"):
+        agent.make(strange)
     assert "all tracks: AD+mlp" in run_cli("models")
     bundle_run(trained_run, "ad-tiny", "layout", models)
     assert [*bundled_models(models)["ad-tiny"].runs] == ["layout"]

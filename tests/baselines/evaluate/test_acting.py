@@ -92,8 +92,18 @@ class TestInvalidRuns:
         wide = dataclasses.asdict(dataclasses.replace(MODEL, width=32))
         with pytest.raises(OptionError, match=r"not a state of this training: params/.*expected float32 .*, found"):
             find_agent(copied_run("wider", model=wide))
+        with pytest.raises(
+            OptionError, match=r"expected float32 .*, or use this run with version 9\.9 of this package"
+        ):
+            find_agent(copied_run("wider-old", model=wide, package_version="9.9"))
         with pytest.raises(OptionError, match="does not describe a run on learning histories: KeyError"):
             find_agent(copied_run("other", model={}, histories={}))
+        with pytest.raises(
+            OptionError, match=r"learning histories: TypeError\(.*'depth'.*, or use this run with version"
+        ):
+            find_agent(copied_run("option", model=dataclasses.asdict(MODEL) | {"depth": 3}, package_version="9.9"))
+        with pytest.raises(OptionError, match=r"learning histories: UnknownNameError.*unknown method 'adx'"):
+            find_agent(copied_run("method", method="adx"))
         shutil.rmtree(Path(copied_run("early")) / "checkpoints")
         with pytest.raises(OptionError, match="expected a checkpoint, found none; train until"):
             find_agent(str(tmp_path / "early"))

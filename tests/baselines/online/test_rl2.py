@@ -331,7 +331,7 @@ class TestPreparation:
         assert job.about["histories"]["layouts"] == ["cramped_down"]
 
     def test_tasks_keep_the_recipe_that_their_teammate_prefers(self):
-        """Each task, from histories or from a manifest, has one recipe, which its teammate prefers."""
+        """Tasks from histories or a manifest have only the recipe that their teammate prefers."""
         name = "asymm_both_plain"
         tasks = [one for one in read_tasks(manifest_path("preference", "train")) if one.layout.name == name]
         of_histories = self.prepare(PlayOptions(), (), HistoryOptions((name,), source=("search",)), 256)

@@ -126,9 +126,9 @@ def test_runs_with_different_conditions_or_equal_tasks_are_not_merged():
 
 
 def test_sources_of_results_are_separate_for_each_track(tmp_path):
-    """A bundled model has different parameters and training data for each track."""
+    """Some bundled models have different parameters and training data for each track."""
     record = {"teammate": [{"layout": "demo_wide", "family": "H4"}], "layout": []}
-    run = evaluated_run("ad-reference", ("demo_wide", "cramped_down"), details={"trained_on": record}, trained_on=None)
+    run = evaluated_run("rl2-reference", ("demo_wide", "cramped_down"), details={"trained_on": record}, trained_on=None)
     assert [source.layouts for source in run.sources] == [("demo_wide",), ("cramped_down",)]
     assert [cell[:2] for cell in run.cells if run.overlaps([cell])] == [("demo_wide", "H4")]
-    assert dataclasses.replace(run, note="x").label == "ad-reference [x]"
+    assert dataclasses.replace(run, note="x").label == "rl2-reference [x]"

@@ -386,6 +386,12 @@ class TestHeldOut:
             ("dpt", 7, {"every": 2}, "every = 2: dpt learns from contexts, but only windows can skip episodes"),
             ("dpt", 7, {"balance": True}, "balance = True: dpt draws tasks and contexts.*leave out --balance"),
             ("dpt", 7, {"at_start": 0.5}, "at_start = 0.5: dpt draws tasks and contexts.*leave out --at-start"),
+            (
+                "dpt",
+                7,
+                {"queries": 9},
+                "queries = 9: a context of 7 transitions has 8 prefixes .* choose at most 8 queries",
+            ),
             ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
             ("ad", 7, {"order": "random"}, "order = random: ad learns from windows in order"),
         ],

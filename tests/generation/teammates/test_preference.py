@@ -1,4 +1,4 @@
-"""Test the tasks of the track `preference`: disjoint splits, and layouts that hide the recipe."""
+"""Test tasks of the track `preference`: what splits share, and layouts that hide the recipe."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def split_tasks() -> dict[str, list[Task]]:
     return {split: preference_tasks(split) for split in ("train", "validation", "test")}
 
 
-def test_preference_splits_share_no_teammates_and_hold_out_layouts_and_recipes(split_tasks):
+def test_preference_training_shares_no_teammates_and_holds_out_layouts_and_recipes(split_tasks):
     """Training tasks have no test teammate, and half of the test tasks are on new layouts.
 
     Training tasks use all recipes of layouts with 4 recipes, and 7 recipes of layouts with 10 recipes.
