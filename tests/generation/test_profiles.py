@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -212,6 +213,9 @@ def test_profile_overrides_settings_of_its_base(tmp_path):
     assert mine.search == replace(base.search, episodes=12)
     assert mine.scripted_config("asymm_both_plain", "search") == replace(base.search, episodes=12, histories=3)
     assert mine.units() == base.units()
+    path.write_text('base = "search"\n[tasks]\nall_dishes = true\n')
+    more, fewer = (Counter(unit.task.split for unit in found.units()) for found in (load_profile(str(path)), base))
+    assert more["train"] == 5 * fewer["train"] and more["validation"] == fewer["validation"]
     path.write_text('base = "noise"\n[tasks.sampled]\nper_layout = { demo_wide = 2 }\n')
     sampled = load_profile(str(path)).sampled
     assert sampled is not None
@@ -307,6 +311,11 @@ H3 = 'families = ["assembly_line"]'
         ("presets =", 'sources = ["ppo", "nois"]\npresets =', "nois"),
         ("presets =", 'sources = ["ppo", "search"]\npresets =', r"tasks\.preference = \[\]"),
         ("presets =", 'preference = ["all"]\npresets =', r"tasks\.preference = \['all'\].*expected .* contains search"),
+        (
+            "presets =",
+            "all_dishes = true\npresets =",
+            r"tasks\.all_dishes = true: expected layouts in tasks\.preference",
+        ),
         ("presets =", 'algorithms = { cramped_up = ["fcp", "fcp"] }\npresets =', "cramped_up"),
         ("[release]", "[noise]\nend = [0.3, 0.1]\n[release]", "end"),
         ("[release]", "[noise]\nbegin = [0, 0.7]\nfinish = 0.5\n[release]", "begin"),

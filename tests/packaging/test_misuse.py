@@ -100,7 +100,7 @@ train ad --layout all --channels own | channels = own: the layouts coord_simple,
 report empty | empty: no results in empty/tasks; run `icrl4aht-data evaluate --out empty`
 evaluate --agent stay --out e --layout cramped_up | no task on cramped_up in
 evaluate --agent stay --out e --track teammate --layout demo_wide --layout asymm_right | no task on asymm_right in the
-evaluate --agent stay --out e --layout demo_wide --family H4 --family rl | no task with rl in the tasks of split test,
+evaluate --agent stay --out e --layout demo_wide --family H4 --family rl | no task on demo_wide with rl in the tasks
 train ad --layout demo_wide --layout cramped_down | no chosen history is on cramped_down, only on demo_wide;
 collect --agent stay --layout demo_wide --layout asymm_right --out c | no chosen history is on asymm_right, only on
 best-response --layout demo_wide --init rl2-reference --width 64 --out b | width = 64: rl2-reference has width 128

@@ -37,7 +37,7 @@ so it is computed once for each episode with either value."""
 
 OTHER_WAYS = ("greedy", "sampled")
 """Ways of choosing actions, see `PlayMode.greedy`. Results that were not made in a model's default way name the way
-that was used, such as "ad-reference (greedy)"."""
+that was used, such as "rl2-reference (greedy)"."""
 
 
 class PlayMode(NamedTuple):
@@ -58,7 +58,7 @@ class PlayMode(NamedTuple):
 
 
 AS_PUBLISHED = PlayMode()
-"""Default play mode of runs. The package's bundled models sample their actions."""
+"""Default play mode of runs; most bundled models sample their actions."""
 
 
 class NamedEgo(NamedTuple):

@@ -56,7 +56,7 @@ greedy_option = click.option(
     "--greedy/--sampled",
     default=None,
     help="Take a trained model's most probable actions, or sample its actions.",
-    show_default="greedy; sampled for a bundled model",
+    show_default="greedy; for a bundled model see `models`",
 )
 _ONLY_LAYOUTS: Any = {"multiple": True, "help": "Only on this layout; repeat for several."}
 only_layouts_option = click.option("--layout", "layouts", type=LAYOUT, **_ONLY_LAYOUTS)
@@ -123,10 +123,10 @@ def chosen_tasks(
     chosen = [task for task in chosen if not families or task.teammate_family in families]
     # Tasks of some layouts or families only would be a smaller evaluation than the user asked for.
     played = {task.layout.name for task in chosen} | {task.teammate_family for task in chosen}
-    missing = [(word, {*of} - played) for word, of in (("on", names), ("with", families))]
-    if not chosen or any(of for _, of in missing):
+    missing = {word: {*of} - played or {*of} for word, of in (("on", names), ("with", families)) if of}
+    if not {*names, *families} <= played or not chosen:
         found = manifest or f"the tasks of split {' and '.join(split)}, track {' and '.join(track)}"
-        wanted = "".join(f" {word} {', '.join(sorted(of))}" for word, of in missing if of)
+        wanted = "".join(f" {word} {', '.join(sorted(of))}" for word, of in missing.items())
         raise EmptySelectionError(f"no task{wanted} in {found}: choose another --layout or --family, or leave them out")
     return chosen
 

@@ -276,6 +276,8 @@ def train_command(
     job, description = shared.prepare_training(method, size, model, train, play, choice, manifests)
     click.echo(description)
     params, steps = None if init is None else load_initial_params(init, job.method, job.about), job.options.steps
+    if init is not None:
+        click.echo(f"starting from {init}, which was trained on data version {job.about['init']['data_version']}")
     with progress_bars(unit="steps") as show:
         job.train(folder, params=params, log_to=log_to, done=show_steps(show, method, steps))
     trained = counted_noun(steps, "step")

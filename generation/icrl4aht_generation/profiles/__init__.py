@@ -83,6 +83,7 @@ class _Tasks(Struct, forbid_unknown_fields=True):
     spread: _Spread | None = None
     algorithms: _Names | dict[str, _Names] = ()
     preference: _Names = ()
+    all_dishes: bool = False
 
 
 class _ProfileFile(Struct, forbid_unknown_fields=True):
@@ -244,6 +245,8 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
             f"tasks.preference = {list(tasks.preference)}, tasks.sources = {list(sources)}: expected layouts in "
             f"tasks.preference if tasks.sources contains search, and none otherwise"
         )
+    if tasks.all_dishes and not preference:
+        raise OptionError("tasks.all_dishes = true: expected layouts in tasks.preference, found none; name layouts")
     if "ppo" not in sources:
         release.keep = 0
     ego, ego_layouts = _read_section("ego", content.ego, PPOConfig(), layouts)
@@ -262,6 +265,7 @@ def _build_profile(name: str, content: _ProfileFile) -> Profile:
         scripted_layouts={"noise": noise_layouts, "search": search_layouts},
         generated=generated,
         preference=_check_distinct("tasks.preference", preference),
+        all_dishes=tasks.all_dishes,
         layouts=layouts,
         sources=sources,
         learners=tasks.learners,

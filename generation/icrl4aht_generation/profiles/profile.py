@@ -28,6 +28,7 @@ from icrl4aht_generation.learners.checkpoint import POLICY_CHECKPOINTS
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.teammates.draws import VALIDATION_SEED, drawn_teammates
+from icrl4aht_generation.teammates.preference import all_training_tasks
 from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_teammate
 from icrl4aht_generation.teammates.spread import spread_teammates
 
@@ -167,6 +168,8 @@ class Profile:
             layouts, with `family`, `count`, `split` and `teammates`, the number of diverse teammates (default 0).
         preference: layouts of the source "search", which has the training and validation tasks of the track
             `preference` on these layouts.
+        all_dishes: whether the source "search" has a training task for each teammate and dish, not only the training
+            tasks of the track, in which most teammates want one dish.
         policies: whether the release contains the policies that label the histories.
         oracle_actions: whether the release contains the scripted oracle's action at every step.
         least_improvement: minimum improvement from the initial to the final return of an ego's history in the release;
@@ -197,6 +200,7 @@ class Profile:
     scripted_layouts: dict[str, dict[str, NoiseConfig]] = field(default_factory=dict)
     generated: dict[str, int] = field(default_factory=dict)
     preference: tuple[str, ...] = ()
+    all_dishes: bool = False
     policies: bool = False
     oracle_actions: bool = False
     least_improvement: float | None = None
@@ -300,6 +304,8 @@ class Profile:
             first = _first_seed(source) + PREFERENCE_LAYOUTS["train"].index(layout) * _LAYOUT_SEEDS
             paths = (manifest_path(PREFERENCE, split) for split in ("train", "validation"))
             own = [task for path in paths for task in read_tasks(path) if task.layout.name == layout]
+            if self.all_dishes:
+                own = [*all_training_tasks(layout), *(task for task in own if task.split != "train")]
             return [
                 make_task(task.track, task.split, layout, task.teammate, first + number, task.recipes)
                 for number, task in enumerate(own)

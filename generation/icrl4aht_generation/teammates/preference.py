@@ -13,7 +13,7 @@ layouts with ten dishes, up to three dishes only occur in test tasks.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, product
 from typing import Any
 
 from icrl4aht_data.benchmark.facts import PLAIN, PREFERENCE, PREFERENCE_LAYOUTS
@@ -52,6 +52,17 @@ def preference_tasks(split: str) -> list[Task]:
             for dish, mate in _dishes_and_teammates(get_layout(name), split, number, part):
                 tasks.append(make_task(PREFERENCE, split, name, mate, 0, [dish]))
     return tasks
+
+
+def all_training_tasks(layout: str) -> list[Task]:
+    """Return a task for each training teammate and training dish of a layout of the track (short name).
+
+    The training tasks of the track are a fifth of them. There most teammates want one dish only, so a model can learn
+    which teammate wants which dish, instead of finding out the dish.
+    """
+    found = get_layout(layout)
+    pairs = product(_teammates(found, "train"), training_dishes(found))
+    return [make_task(PREFERENCE, "train", layout, mate, 0, [dish]) for mate, dish in pairs]
 
 
 def _dishes_and_teammates(layout: Layout, split: str, number: int, part: str) -> Iterator[tuple[Dish, dict[str, Any]]]:

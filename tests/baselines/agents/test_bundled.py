@@ -16,8 +16,9 @@ from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.report.comparison import describe_scores
 from icrl4aht_baselines.report.stored_results import read_stored, results_file
-from icrl4aht_baselines.training.histories import prepare, read_trained
+from icrl4aht_baselines.training.histories import load_initial_params, prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
+from icrl4aht_baselines.training.run_folder import read_config
 from PIL import Image
 
 from icrl4aht_data.errors import OptionError, UnknownNameError
@@ -133,6 +134,16 @@ def test_training_rejects_initial_parameters_of_another_model_size(trained_run, 
     with pytest.raises(OptionError, match=r"trained with other options \(.*positions = 'none', not 'rope'"):
         run_cli(*arguments, *small, "--layers", "1", "--width", "8", "--positions", "rope")
     assert not Path(out).exists()
+
+
+def test_settings_state_the_versions_of_the_run_that_a_training_starts_from(trained_run):
+    histories = HistoryOptions(("demo_wide",), source=("noise",), channels="canonical", labels="oracle")
+    job, config = prepare("ad", MODEL, OPTIONS, histories), read_config(trained_run)
+    load_initial_params(trained_run, job.method, job.about)
+    found = job.about["init"]
+    assert (found["run"], found["step"]) == (read_trained(trained_run).hash, 1) and "init" not in found
+    stated = {name: config["histories"][name] for name in ("data_version", "manifest_sha256")}
+    assert found.items() >= (stated | {"package_version": config["package_version"]}).items()
 
 
 def test_models_command_lists_bundled_models(models):

@@ -165,7 +165,7 @@ class TestStateFile:
     )
     def test_state_with_unexpected_arrays_raises_error_with_their_names(self, file, like, message):
         file.save({"count": jnp.int32(7)}, 1)
-        with pytest.raises(OptionError, match=rf"s\.safetensors: not a state of this training: {message}; remove"):
+        with pytest.raises(OptionError, match=rf"s\.safetensors: not a state of this training: {message}; restore"):
             file.load(like)
 
     def test_state_saved_with_other_settings_raises_error_with_the_difference(self, file):
@@ -180,7 +180,7 @@ class TestStateFile:
             file.load({})
         file.path.write_bytes(b"not a state")
         for read in (lambda: file.progress, lambda: file.load({})):
-            with pytest.raises(OptionError, match=r"s\.safetensors: not a state of this training: .*remove the file"):
+            with pytest.raises(OptionError, match=r"s\.safetensors: not a state of this training: .*or remove it"):
                 read()
 
     def test_saving_two_leaves_with_the_same_path_raises_error(self, file):

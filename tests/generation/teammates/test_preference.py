@@ -8,7 +8,13 @@ import pytest
 from icrl4aht_generation.layouts.families import generate_layouts, split_of
 from icrl4aht_generation.layouts.grids import canonical_map
 from icrl4aht_generation.teammates.instances import INSTANCES
-from icrl4aht_generation.teammates.preference import WATCHER, all_dishes, preference_tasks, training_dishes
+from icrl4aht_generation.teammates.preference import (
+    WATCHER,
+    all_dishes,
+    all_training_tasks,
+    preference_tasks,
+    training_dishes,
+)
 
 from icrl4aht_data.benchmark.facts import PREFERENCE_LAYOUTS
 from icrl4aht_data.benchmark.tasks import Task, teammate_id
@@ -49,6 +55,17 @@ def test_preference_training_shares_no_teammates_and_holds_out_layouts_and_recip
     assert all(len(found) >= 4 for found in of_dish.values()), "each held-out recipe has teammates of several families"
     families = {split: {task.teammate_family for task in tasks} for split, tasks in split_tasks.items()}
     assert families["train"] == families["test"] == {"H1", "H2", "H3", "H4"}
+
+
+def test_all_training_tasks_pair_each_teammate_with_each_dish(split_tasks):
+    for name in ("asymm_both_plain", "rooms-0-46"):
+        tasks = all_training_tasks(name)
+        pairs = {(teammate_id(task.teammate), task.recipes) for task in tasks}
+        dishes = {dishes for _, dishes in pairs}
+        assert len(tasks) == len(pairs) == len({mate for mate, _ in pairs}) * len(dishes) == 20 * len(dishes)
+        published = [task for task in split_tasks["train"] if task.layout_name == name]
+        assert len(tasks) == 5 * len(published)
+        assert {(teammate_id(task.teammate), task.recipes) for task in published} < pairs
 
 
 def test_preference_layouts_hide_the_recipe_and_match_their_names():
