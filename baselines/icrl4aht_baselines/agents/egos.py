@@ -169,7 +169,8 @@ def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Lay
     """Return a function from a layout to the policy of a trained model.
 
     The function raises OptionError with the name of `folder` if the layout's observations do not have the shape that
-    the model was trained on. Models that take canonical channels play on every layout whose ingredients have them.
+    the model was trained on. A model with canonical channels plays on every layout whose ingredients all have a
+    canonical channel; for other layouts the function raises OptionError, too.
     """
     policy = trained_policy(run.method, run.params, run.context, mode)
 

@@ -123,10 +123,10 @@ def chosen_tasks(
     chosen = [task for task in chosen if not families or task.teammate_family in families]
     # Tasks of some layouts or families only would be a smaller evaluation than the user asked for.
     played = {task.layout.name for task in chosen} | {task.teammate_family for task in chosen}
-    missing = {word: {*of} - played or {*of} for word, of in (("on", names), ("with", families)) if of}
-    if not {*names, *families} <= played or not chosen:
+    if not chosen or not played.issuperset({*names, *families}):
         found = manifest or f"the tasks of split {' and '.join(split)}, track {' and '.join(track)}"
-        wanted = "".join(f" {word} {', '.join(sorted(of))}" for word, of in missing.items())
+        given_values = (("on", names), ("with", {*families}))
+        wanted = "".join(f" {word} {', '.join(sorted(of - played or of))}" for word, of in given_values if of)
         raise EmptySelectionError(f"no task{wanted} in {found}: choose another --layout or --family, or leave them out")
     return chosen
 
