@@ -31,10 +31,11 @@ MEMORY_TO_FREE = 1200 * 2**20
 """Memory in bytes above which a test worker clears JAX's compiled programs."""
 
 SharedFolder = Callable[[str, Callable[[Path], object]], Path]
-COMPILATION_CACHE: dict[str, Any] = {
+JAX_SETTINGS: dict[str, Any] = {
     "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".cache" / "jax"),
     "jax_compilation_cache_max_size": 2 * 2**30,  # with a limit, JAX locks the folder, which processes share
     "jax_persistent_cache_min_compile_time_secs": 0.1,  # with 0.5, tests take 50% more CPU time (cache filled)
+    "jax_cpu_enable_async_dispatch": False,  # as in the package's jobs with one thread
 }
 COSTLIEST = """
 collect notebooks wheel reference heuristics scripted rl2 suite generate run fetch gymnasium_env docs models trainer
@@ -65,11 +66,11 @@ def pytest_configure() -> None:
     os.environ.setdefault(
         "PJRT_NPROC", "1"
     )  # one thread, as in the package's profiles for CPUs; read when JAX is first used
-    for name, value in COMPILATION_CACHE.items():
+    for name, value in JAX_SETTINGS.items():
         jax.config.update(name, value)
         os.environ[name.upper()] = str(value)
     if "PYTEST_XDIST_WORKER" not in os.environ:
-        _remove_unfinished_entries(Path(COMPILATION_CACHE["jax_compilation_cache_dir"]))
+        _remove_unfinished_entries(Path(JAX_SETTINGS["jax_compilation_cache_dir"]))
 
 
 def _remove_unfinished_entries(folder: Path) -> None:

@@ -1,12 +1,8 @@
-"""Make the reference models, from a release of scripted histories to evaluated models and their cards.
+"""Make the reference models, from a release of histories to evaluated models and their cards.
 
     OUT/PROFILE/lite                    release that `icrl4aht-data generate --profile PROFILE` makes
-    OUT/agent-TRACK[-TEACHER]           histories of the teacher with falling noise, see `RL2_HISTORIES`; TEACHER is the
-                                        name of a model, or the name and a hash of a folder's path
+    OUT/bundled-PROFILE                 its histories together with those of the bundled release, of chosen sources
     OUT/NAME-TRACK-sSEED/run            run folder of the model NAME
-    OUT/NAME-TRACK-sSEED/first          run folder of the first of two training runs of a model
-    OUT/NAME-TRACK-sSEED/own            histories that the model of the first run plays, labelled by the teacher
-    OUT/NAME-TRACK-sSEED/mixed          these histories together with those that the first run learned from
     OUT/NAME-TRACK-sSEED/results/KIND   results on validation tasks and on test tasks, see `EVALUATIONS`; in subfolders
                                         `cleared` and `swapped` those of controls
 
@@ -18,14 +14,13 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
-from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from msgspec import to_builtins
 
 from icrl4aht_baselines.agents.bundled import EVERY_TRACK, MODEL_CARD, MODELS, format_track
@@ -33,7 +28,6 @@ from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.protocols import CONTROLS, bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.rollout import ProgramCache
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
-from icrl4aht_baselines.online.agent_histories import collect_release, release_teammates
 from icrl4aht_baselines.online.prepare import prepare_play
 from icrl4aht_baselines.report.page import instances_range, summary_lines
 from icrl4aht_baselines.report.results import (
@@ -55,19 +49,10 @@ from icrl4aht_data.benchmark.facts import ALL_TRACKS, KEPT_STEPS, PREFERENCE, TR
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import process_lock, short_hash
+from icrl4aht_data.utils.files import process_lock
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import fill_template, markdown_table
 from icrl4aht_data.writing.combine import combine_releases
-
-RL2_HISTORIES = NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8))
-"""Number and noise of the histories that RL^2 plays with each teammate. Every history ends without noise."""
-
-OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
-"""Noise and number of the histories that a model itself plays for its second training: 1 in 9 of all episodes."""
-
-OWN_SHARE = 0.5
-"""Learning rate of a model's second training relative to that of the first."""
 
 _PUBLISHED = tuple(TRACKS)
 
@@ -106,18 +91,16 @@ class ReferenceSettings:
 
     Attributes:
         method: name of the method.
-        plays: whether the model learns by playing, not from histories that `rl2-reference` plays.
+        plays: whether the model learns by playing, not from histories.
         model: values of `ModelOptions`.
         train: values of `TrainOptions`.
         histories: values of `HistoryOptions`.
         play: values of `PlayOptions`.
-        profile: profile of the release that names the training teammates.
+        profile: profile of the release with the training teammates, or with histories to learn from besides those of
+            the bundled release; empty for the bundled release alone.
         start: name of a bundled model; training starts with its parameters for track `teammate`, or with random
             parameters if the name is empty.
         one_model: whether the same model plays all tracks, see `EVERY_TRACK`.
-        own_round: whether a second training run follows, on the first histories and on histories that the model itself
-            plays and RL^2 labels.
-        greedy: whether the model takes its most probable actions or samples its actions.
         role: purpose of the model in the package.
     """
 
@@ -130,8 +113,6 @@ class ReferenceSettings:
     profile: str = "noise"
     start: str = ""
     one_model: bool = False
-    own_round: bool = False
-    greedy: bool = False
     role: str = ""
 
     @property
@@ -141,9 +122,7 @@ class ReferenceSettings:
 
 
 _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
-_STEPS: dict[str, Any] = {"steps": 4000, "batch_size": 16, "context": 200, "learning_rate": 2e-3}
-# With K + 1 queries, each prefix of a context of K transitions has its own query.
-_QUERIES: dict[str, Any] = {"labels": "expert", "queries": _STEPS["context"] + 1}
+_HISTORIES_TRAIN: dict[str, Any] = {"batch_size": 8, "context": 500, "learning_rate": 2e-3}
 _ADAPTING: dict[str, Any] = {"steps": 320, "batch_size": 384, "log_every": 5, "save_every": 20}
 
 REFERENCE_SETTINGS = {
@@ -162,39 +141,37 @@ REFERENCE_SETTINGS = {
         role="adapts best",
     ),
     "ad-reference": ReferenceSettings(
-        "ad", False, _TINY, _STEPS, {"labels": "expert"}, own_round=True, greedy=True, role="best of AD"
+        "ad",
+        model=_TINY,
+        train={**_HISTORIES_TRAIN, "steps": 8000},
+        histories={"source": ("agent", "search"), "labels": "expert", "balance": True, "at_start": 0.5},
+        profile="teach",
+        one_model=True,
+        role="AD on released histories",
     ),
     "dpt-reference": ReferenceSettings(
-        "dpt", False, _TINY, {**_STEPS, "steps": 2000}, _QUERIES, own_round=True, role="best of DPT"
+        "dpt",
+        model=_TINY,
+        train={**_HISTORIES_TRAIN, "steps": 4000},
+        # With K + 1 queries, each prefix of a context of K transitions has its own query.
+        histories={"source": ("agent",), "labels": "expert", "queries": _HISTORIES_TRAIN["context"] + 1},
+        profile="",
+        one_model=True,
+        role="DPT on released histories",
     ),
 }
 """Name of a reference model -> how it is made. The bundled models have the same names."""
 
 
-def check_learns_from_teacher(name: str) -> None:
-    """Check that a reference model learns from histories of a teacher, so that a teacher can be chosen.
-
-    Raises:
-        OptionError: if the model learns by playing.
-    """
-    if REFERENCE_SETTINGS[name].plays:
-        taught = ", ".join(each for each, reference in REFERENCE_SETTINGS.items() if not reference.plays)
-        raise OptionError(
-            f"{name} does not learn from a teacher's histories; leave out --teacher, or choose another --name: {taught}"
-        )
-
-
 @dataclass(frozen=True)
 class ReferenceJob(TrainingJob):
-    """Job that trains a reference model for a track. Existing releases are reused.
+    """Job that trains a reference model for a track, or for all tracks. Existing releases are reused.
 
     Attributes:
         model: name in `REFERENCE_SETTINGS`.
         track: name of the track, or `EVERY_TRACK`.
-        seed: seed of the training runs.
+        seed: seed of the training run.
         out: folder of all jobs, with the content that the top of this module describes.
-        teacher: name or run folder of the agent that plays and labels the histories, such as `rl2-reference`; if None,
-            RL^2 is trained first.
         xla_threads: see `Job`.
     """
 
@@ -202,7 +179,6 @@ class ReferenceJob(TrainingJob):
     track: str
     seed: int
     out: Path
-    teacher: str | None = None
     xla_threads: int | None = None
 
     @property
@@ -222,13 +198,8 @@ class ReferenceJob(TrainingJob):
 
     @property
     def training(self) -> TrainOptions:
-        """Settings of a training run, for the trainer."""
+        """Settings of the training run, for the trainer."""
         return TrainOptions(**self.reference.train, seed=self.seed)
-
-    @property
-    def updates(self) -> int:
-        """Number of training steps, summed over both training runs if there are two."""
-        return self.training.steps * (1 + self.reference.own_round)
 
     @property
     def steps_per_update(self) -> int:
@@ -240,25 +211,15 @@ class ReferenceJob(TrainingJob):
     def settings(self) -> dict[str, Any]:
         """All settings that the result depends on, as JSON. The content of releases is not included."""
         views, play = TRACK_VIEWS[self.track], TRACK_PLAY[self.track]
-        data = {"teacher": self.teacher, "noise": (RL2_HISTORIES, OWN_HISTORIES)}
         code = {"code_version": version("icrl4aht-data")}
-        return to_builtins({"reference": self.reference, "views": views, "play": play, **data, **code})
-
-    def runs(self) -> list[tuple[Path, int]]:
-        """Return the folders of the training runs, last run first, with the number of earlier training steps."""
-        return [(self.run_folder, self.updates - self.training.steps), (self.folder / "first", 0)]
+        return to_builtins({"reference": self.reference, "views": views, "play": play, **code})
 
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
         """Make the training data and train the model. Return no measured values."""
         if self.reference.plays:
             self.train_by_playing(on_update)
-            return {}
-        histories, first = self.teacher_histories(), None
-        if self.reference.own_round:
-            first = self.folder / "first"
-            self.train(histories, first, on_update)
-            histories = self.add_own_histories(histories, first)
-        self.train(histories, self.run_folder, on_update, before=first)
+        else:
+            self.train_on_histories(on_update)
         return {}
 
     def generated_release(self, profile: str) -> Path:
@@ -274,14 +235,26 @@ class ReferenceJob(TrainingJob):
                     )
         return folder / "lite"
 
-    def teammates(self, number: int = 0) -> Any:
-        """Return the teammates of the noise histories on the track's layouts, of `diverse_tasks` and validation tasks.
+    def released_histories(self) -> Path | None:
+        """Return the folder of a release with the histories to learn from; None for the bundled release.
 
-        Args:
-            number: number of the collection, which determines the seeds of the tasks, see `release_teammates`.
+        The folder is made if it is missing: from the profile's release, and the bundled histories of other sources.
         """
-        noise = load_icrl4aht(self.generated_release("noise"), layout=list(TRACKS[self.track]["train"]))
-        return release_teammates(noise, number, [*self.diverse_tasks(), *bundled_tasks(self.track, "validation")])
+        profile, source = self.reference.profile, self.reference.histories["source"]
+        if not profile:
+            return None
+        others, bundled = load_icrl4aht(self.generated_release(profile), source=source), load_icrl4aht()
+        folder, wanted = self.out / f"bundled-{profile}", bundled.info.data_version
+        with process_lock(self.out / f".{folder.name}.combining.lock"):
+            if not folder.is_dir():
+                own = bundled.filter(source=[name for name in source if name not in others.index.values("source")])
+                combine_releases(folder, [own, others], wanted)
+        if (found := load_icrl4aht(folder).info.data_version) != wanted:
+            raise OptionError(
+                f"{folder}: made from data version {found}, but the bundled release has {wanted}; remove {folder} and "
+                f"{self.out / profile}, or choose another --out"
+            )
+        return folder
 
     def diverse_tasks(self) -> list[Task]:
         """Return the bundled training tasks of the track with diverse teammates; none for `EVERY_TRACK`."""
@@ -301,50 +274,12 @@ class ReferenceJob(TrainingJob):
         )
         job.train(self.run_folder, params=params, done=self.step_progress(on_update))
 
-    def trained_teacher(self) -> str | Path:
-        """Return the name or run folder of the teacher. If no teacher was given, train RL^2 first."""
-        if self.teacher:
-            return self.teacher
-        job = ReferenceJob("rl2-reference", self.track, 0, self.out, xla_threads=self.xla_threads)
-        job.run(wait=True)
-        return job.run_folder
-
-    def teacher_histories(self) -> Path:
-        """Record histories of the teacher, with noise as in `RL2_HISTORIES`. Return the folder of the release."""
-        parts = ["agent", self.track]
-        if self.teacher:  # run folders of different teachers may have equal names
-            path = Path(self.teacher)
-            parts += [path.name, *([short_hash(str(path.resolve()).encode(), 8)] if path.is_dir() else [])]
-        folder = self.out / "-".join(parts)
-        with process_lock(folder.with_name(f".{folder.name}.recording.lock")):
-            if not folder.is_dir():
-                collect_release(
-                    find_agent(self.trained_teacher(), greedy=False), self.teammates(), RL2_HISTORIES, folder
-                )
-        return folder
-
-    def train(self, root: Path, folder: Path, on_update: OnUpdate, before: Path | None = None) -> None:
-        """Train a model on a release; with `before`, start from this run's parameters, at a lower learning rate."""
-        options = self.training
-        if before:
-            options = replace(options, learning_rate=OWN_SHARE * options.learning_rate)
-        views = {**self.reference.histories, **TRACK_VIEWS[self.track]}
-        histories = HistoryOptions(TRACKS[self.track]["train"], str(root), channels="canonical", **views)
-        job = prepare(self.reference.method, ModelOptions(**self.reference.model), options, histories)
-        params = load_initial_params(before, job.method, job.about) if before else None
-        job.train(folder, params=params, done=self.step_progress(on_update, options.steps if before else 0))
-
-    def add_own_histories(self, histories: Path, first: Path) -> Path:
-        """Record histories of a model, labelled by the teacher. Return a release that adds them to `histories`."""
-        own, mixed = self.folder / "own", self.folder / "mixed"
-        if not mixed.is_dir():
-            if not own.is_dir():
-                teammates, agent = self.teammates(number=1), find_agent(first, greedy=False)
-                collect_release(
-                    agent, teammates, OWN_HISTORIES, own, labeller=find_agent(self.trained_teacher(), greedy=True)
-                )
-            combine_releases(mixed, [histories, own])
-        return mixed
+    def train_on_histories(self, on_update: OnUpdate) -> None:
+        """Train a model on the histories of `released_histories`, of all layouts."""
+        root = self.released_histories()
+        histories = HistoryOptions((ALL_LAYOUTS,), str(root) if root else None, **self.reference.histories)
+        job = prepare(self.reference.method, ModelOptions(**self.reference.model), self.training, histories)
+        job.train(self.run_folder, done=self.step_progress(on_update))
 
     def evaluation_tasks(self, kind: str) -> list[Task]:
         """Return the tasks of an evaluation that the model plays as a bundled model.
@@ -364,7 +299,7 @@ class ReferenceJob(TrainingJob):
 
     def evaluate(self, show: Callable[..., None]) -> None:
         """Evaluate the trained model, with the function `show` for progress; on test tasks also with controls."""
-        agent = find_agent(self.run_folder, greedy=self.reference.greedy)._replace(name=self.model)
+        agent = find_agent(self.run_folder, greedy=False)._replace(name=self.model)
         programs = ProgramCache()
         for kind, (_, _, protocol, seeds) in EVALUATIONS.items():
             tasks = self.evaluation_tasks(kind)
@@ -379,7 +314,7 @@ def write_bundled_card(name: str, jobs: Sequence[ReferenceJob], folder: Path = M
 
     Args:
         name: name of the bundled model.
-        jobs: finished and evaluated jobs of the model, one for each track.
+        jobs: finished and evaluated jobs of the model, one for each track, or one for all tracks.
         folder: folder of the bundled models.
     """
     (run,) = merge([read_run(job.results(kind)) for job in jobs for kind in _CONTROLLED])
@@ -395,9 +330,7 @@ def write_bundled_card(name: str, jobs: Sequence[ReferenceJob], folder: Path = M
         "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
         *overlap_legend(overlaps),
     ]
-    taught = f" --teacher {jobs[0].teacher}" if jobs[0].teacher else ""
-    command = f"icrl4aht-data research reference --name {jobs[0].model}{taught} --bundle-as {name}"
-    recorded = "" if "groups" in config["histories"] else "These histories were recorded for it, and are in no release."
+    command = f"icrl4aht-data research reference --name {jobs[0].model} --bundle-as {name}"
     properties = [
         f"| method | {config['method']} |",
         f"| created with | icrl4aht-data {config['package_version']} |",
@@ -409,7 +342,7 @@ def write_bundled_card(name: str, jobs: Sequence[ReferenceJob], folder: Path = M
         "baseline.md",
         title=name,
         method=config["method"],
-        training=" ".join([*dict.fromkeys(map(training_sentence, configs)), recorded]).rstrip(),
+        training=" ".join(dict.fromkeys(map(training_sentence, configs))),
         properties="\n".join(properties),
         models="\n".join(_model_row(run, sources) for sources in models.values()),
         protocol=run.protocol,

@@ -309,8 +309,8 @@ def test_the_installed_size_is_limited(bare_environment, capsys):
     )
     assert own - release - sum(models) <= CODE_BYTES
     assert 0 < release <= RELEASE_BYTES
-    # Three models have one training run per track, and one model has a single run for both tracks.
-    assert len(models) == 7 and all(0 < model <= MODEL_BYTES for model in models)
+    # One model has a training run per track, and three models have a single run for all tracks.
+    assert len(models) == 5 and all(0 < model <= MODEL_BYTES for model in models)
     assert sum(sizes.values()) <= ENVIRONMENT_BYTES
     page = (ROOT / "docs" / "start.md").read_text(encoding="utf-8")
     stated = re.search(r"(\d+) MB\s+installed, (\d+) MB with the required dependencies", page)

@@ -33,7 +33,7 @@ MODEL_CARD = "README.md"
 """File name of a bundled model's card, in the folder `models/NAME`."""
 
 BUNDLE = "bundle.json"
-"""Name of the JSON file with the last three fields of a `BundledModel`, in the folder `models/NAME`."""
+"""Name of the JSON file with the last two fields of a `BundledModel`, in the folder `models/NAME`."""
 
 EVERY_TRACK = "all"
 """Name, in place of a track, of a run that plays the tasks of all tracks."""
@@ -42,20 +42,18 @@ _LARGEST = 2 * 10**6  # maximum size of a bundled model's parameters, in bytes
 
 
 class BundledModel(NamedTuple):
-    """A trained model that is part of this package.
+    """A trained model that is part of this package. By default it samples its actions.
 
     Attributes:
         name: name of the model, such as "ad-reference".
         runs: name of a track -> run folder of the model for this track; a model for all tracks has the only key
             `EVERY_TRACK`.
-        sampled: whether the model samples its actions by default, instead of taking the most probable ones.
         role: purpose of the model, such as "plays best".
         date: day on which the model was bundled, such as "2026-11-24".
     """
 
     name: str
     runs: dict[str, Path]
-    sampled: bool = False
     role: str = ""
     date: str = ""
 
@@ -90,7 +88,6 @@ def describe_model(model: BundledModel) -> list[str]:
         lines.append(
             f"{format_track(track)}: {trained.label}, {count:,} parameters{context}, {trained.step:,} steps on "
             f"{listed_names(trained.layouts)} (source {' and '.join(sources)})"
-            + (", draws its actions" if model.sampled else "")
         )
     return lines
 
@@ -105,9 +102,7 @@ def check_bundle_name(name: str) -> None:
         raise OptionError(f"name = {name!r}: expected lowercase words joined by hyphens, such as ad-reference")
 
 
-def bundle_run(
-    run: Path, name: str, track: str, folder: Path = MODELS, *, sampled: bool = False, role: str = ""
-) -> Path:
+def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, role: str = "") -> Path:
     """Copy a finished run to the bundled models, where it replaces earlier runs of its track. Return the new folder.
 
     Args:
@@ -115,7 +110,6 @@ def bundle_run(
         name: name of the bundled model.
         track: track of the tasks that the model plays, or `EVERY_TRACK`.
         folder: folder of the bundled models.
-        sampled: whether the model samples its actions by default, on all tracks.
         role: purpose of the model, such as "plays best".
 
     Raises:
@@ -141,6 +135,5 @@ def bundle_run(
         shutil.copyfile(run / LAYOUTS_NAME, target / LAYOUTS_NAME)
     if (run / RUN_CURVES).is_file():
         shrink_picture(run / RUN_CURVES, target / RUN_CURVES)
-    about = {"sampled": sampled, "role": role, "date": f"{date.today()}"}
-    write_json(folder / name / BUNDLE, about, indent=None)
+    write_json(folder / name / BUNDLE, {"role": role, "date": f"{date.today()}"}, indent=None)
     return target

@@ -58,7 +58,7 @@ class PlayMode(NamedTuple):
 
 
 AS_PUBLISHED = PlayMode()
-"""Default play mode of runs; most bundled models sample their actions."""
+"""Default play mode of runs; bundled models sample their actions."""
 
 
 class NamedEgo(NamedTuple):
@@ -120,7 +120,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
         name: name of a reference ego or of a bundled model, or path of a run folder.
         acting: how a trained model computes its context, see `ACTING`; "cached" by default.
         greedy: True if a trained model takes its most probable action, False if it samples an action; by default True
-            for a run folder, and as `BundledModel.sampled` says for a bundled model.
+            for a run folder, and False for a bundled model.
 
     Raises:
         UnknownNameError: if the name or the value of `acting` is unknown.
@@ -138,7 +138,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
         raise UnknownNameError(
             f"{name}: expected a run folder, but {CONFIG} is missing; `icrl4aht-data train` makes run folders"
         )
-    own_greedy = model is None or not model.sampled
+    own_greedy = model is None
     mode = PlayMode(acting or "cached", own_greedy if greedy is None else greedy)
     suffix = "" if mode.greedy == own_greedy else f" ({OTHER_WAYS[not mode.greedy]})"
     if model is None:

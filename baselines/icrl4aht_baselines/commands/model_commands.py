@@ -125,7 +125,7 @@ def collect_command(
     epilog=examples(
         "icrl4aht-data research reference --name ad-reference",
         "icrl4aht-data research reference --name rl2-reference --track teammate --out runs/reference",
-        "icrl4aht-data research reference --name ad-reference --teacher rl2-reference --seeds 3 --workers 2",
+        "icrl4aht-data research reference --name ad-reference --name dpt-reference --seeds 3 --workers 2",
     ),
 )
 @click.option(
@@ -144,11 +144,6 @@ def collect_command(
     help="Only models of this track, and models of all tracks.",
 )
 @click.option("--seeds", type=COUNT, default=1, help="Training runs of each model, with different seeds.")
-@click.option(
-    "--teacher",
-    type=shared.EGO_NAME,
-    help="Learn from histories of this agent, such as rl2-reference, not of a newly trained one.",
-)
 @click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
 @click.option(
     "--bundle-as",
@@ -162,18 +157,17 @@ def reference_command(
     names: tuple[str, ...],
     track: tuple[str, ...],
     seeds: int,
-    teacher: str | None,
     evaluates: bool,
     bundle: str | None,
     out: Path,
     queue: dict[str, Any],
 ) -> None:
-    """Make reference models, and the data that they are trained on.
+    """Make reference models, and the releases that they are trained on.
 
-    Generates a release of scripted histories, trains a model for each track, and evaluates it. If a model learns from
-    histories of a trained agent, they are recorded first. The same command resumes a stopped run. rl2-reference learns
-    by playing with training teammates. rl2-adapting starts from it and plays tasks with a hidden dish; one model is
-    for all tracks. ad-reference and dpt-reference learn from histories of rl2-reference, labelled with its choices.
+    Generates a release if the model needs one, trains one model for each track or for all tracks, and evaluates it. The
+    same command resumes a stopped run. rl2-reference learns by playing with training teammates. rl2-adapting starts
+    from it and plays tasks with a hidden dish. dpt-reference learns from `agent` histories of the bundled release, with
+    `expert` labels, and ad-reference from these and from `search` histories of profile `teach`, drawn equally often.
     """
     options = read_queue_options(queue)  # sets environment variables, which JAX reads at its first use
     from icrl4aht_generation.jobs.queue import run_jobs
@@ -181,13 +175,7 @@ def reference_command(
     from rich.console import Console
 
     from icrl4aht_baselines.agents.bundled import EVERY_TRACK, bundle_run, check_bundle_name
-    from icrl4aht_baselines.agents.egos import find_agent
-    from icrl4aht_baselines.reference import (
-        REFERENCE_SETTINGS,
-        ReferenceJob,
-        check_learns_from_teacher,
-        write_bundled_card,
-    )
+    from icrl4aht_baselines.reference import REFERENCE_SETTINGS, ReferenceJob, write_bundled_card
 
     if bundle:
         try:
@@ -200,14 +188,9 @@ def reference_command(
                 "results; leave out --track, --seeds and --no-evaluate"
             )
     out = out.resolve()  # workers on a cluster have other working directories
-    if teacher:
-        teacher = str(Path(teacher).resolve()) if Path(teacher).is_dir() else teacher
-        find_agent(teacher)  # reports an invalid name now, not after hours of work
-        for name in names:
-            check_learns_from_teacher(name)
     threads = 1 if options.workers or options.executor == "ray" else None  # a single job may use all cores
     jobs = [
-        ReferenceJob(name, of_track, seed, out, teacher, threads)
+        ReferenceJob(name, of_track, seed, out, threads)
         for seed in range(seeds)
         for name in dict.fromkeys(names)
         for of_track in REFERENCE_SETTINGS[name].tracks
@@ -217,11 +200,9 @@ def reference_command(
         raise click.UsageError(
             f"--track {track[0]}: no model of this track exists for {' and '.join(names)}; leave out --track"
         )
-    taught = {job.track: None for job in jobs if not (job.reference.plays or teacher)}
-    teachers = [ReferenceJob("rl2-reference", of_track, 0, out, xla_threads=threads) for of_track in taught]
     if threads:  # as many threads as in workers: jobs resume only with an equal number
         limit_xla_threads(threads)
-    run_jobs([*dict.fromkeys([*teachers, *jobs])], out, Console(soft_wrap=True), options)
+    run_jobs(jobs, out, Console(soft_wrap=True), options)
     if evaluates:
         with progress_bars() as show:
             for job in jobs:
@@ -230,8 +211,7 @@ def reference_command(
         click.echo(f"{job.label}: {job.folder}")
     if bundle:
         for job in jobs:
-            sampled, role = not job.reference.greedy, job.reference.role
-            click.echo(f"bundled: {bundle_run(job.run_folder, bundle, job.track, sampled=sampled, role=role)}")
+            click.echo(f"bundled: {bundle_run(job.run_folder, bundle, job.track, role=job.reference.role)}")
         click.echo(f"card: {write_bundled_card(bundle, jobs)}")
 
 
@@ -327,8 +307,8 @@ def models_command() -> None:
     """List the bundled models.
 
     `evaluate`, `watch` and `collect` accept these names as agents. The first line of each model states its purpose, its
-    score N on each track, the benefit M of its memory, and its date. A line for each track states method, parameters,
-    context, training layouts and sources, and whether actions are sampled by default.
+    score N on each track, the benefit M of its memory, and its date. A line for each training run states method,
+    parameters, context, training layouts and sources. By default these models sample their actions.
     """
     from icrl4aht_baselines.agents.bundled import bundled_models, describe_model
     from icrl4aht_baselines.report.comparison import describe_scores

@@ -56,7 +56,7 @@ greedy_option = click.option(
     "--greedy/--sampled",
     default=None,
     help="Take a trained model's most probable actions, or sample its actions.",
-    show_default="greedy; for a bundled model see `models`",
+    show_default="greedy; sampled for a bundled model",
 )
 _ONLY_LAYOUTS: Any = {"multiple": True, "help": "Only on this layout; repeat for several."}
 only_layouts_option = click.option("--layout", "layouts", type=LAYOUT, **_ONLY_LAYOUTS)

@@ -89,23 +89,13 @@ class TrainingJob(ABC):
 
     def progress(self) -> tuple[int, float] | None:
         """Return the finished training steps and the speed in environment or history steps/s; None if unknown."""
-        for run, before in self.runs():
-            if timing := last_line(run / TIMING):
-                return before + timing["step"], timing["steps_per_second"] * self.steps_per_update
+        if timing := last_line(self.run_folder / TIMING):
+            return timing["step"], timing["steps_per_second"] * self.steps_per_update
         return None
 
-    def runs(self) -> list[tuple[Path, int]]:
-        """Return (folder, number of earlier training steps) of each training run, last run first."""
-        return [(self.run_folder, 0)]
-
-    def step_progress(self, on_update: OnUpdate, before: int = 0) -> StepProgress:
-        """Return a progress function for the trainer, which passes the progress on to `on_update`.
-
-        Args:
-            on_update: see `Job.run`.
-            before: number of training steps of earlier training runs of the job.
-        """
-        return lambda step, loss: on_update(before + step, (self.progress() or (0, 0.0))[1])
+    def step_progress(self, on_update: OnUpdate) -> StepProgress:
+        """Return a progress function for the trainer, which passes the progress on to `on_update`; see `Job.run`."""
+        return lambda step, loss: on_update(step, (self.progress() or (0, 0.0))[1])
 
     def finished_text(self) -> str:
         """Return a note on the result for progress displays."""

@@ -62,11 +62,15 @@ def xla_threads() -> int | None:
 def limit_xla_threads(threads: int) -> None:
     """Make XLA split operations over a given number of CPU threads; call this before JAX is first used.
 
+    A program for one thread runs in the thread that calls it, so that parallel jobs do not wait for further threads.
+
     Raises:
         OptionError: if JAX is already in use with another number of threads.
     """
     if not backends_are_initialized():
         os.environ[_XLA_THREADS[0]] = str(threads)
+        if threads == 1:
+            jax.config.update("jax_cpu_enable_async_dispatch", False)
     elif xla_threads() not in (None, threads):
         raise OptionError(
             f"XLA runs with {xla_threads()} threads in this process, expected {threads}: set "

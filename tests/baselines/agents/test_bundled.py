@@ -65,15 +65,14 @@ def test_bundled_model_keeps_parameters_and_training_record_of_its_run(trained_r
         assert copied.size == drawn.size and copied.mode == "P"
 
 
-def test_model_bundled_with_sampled_actions_samples_by_default(trained_run, tmp_path, monkeypatch):
-    bundle_run(trained_run, "ad-drawn", "teammate", tmp_path, sampled=True)
+def test_bundled_model_samples_its_actions_by_default(trained_run, tmp_path, monkeypatch):
+    bundle_run(trained_run, "ad-drawn", "teammate", tmp_path)
     monkeypatch.setattr(bundled.bundled_models, "__defaults__", (tmp_path,))
     by_default, greedy = find_agent("ad-drawn"), find_agent("ad-drawn", greedy=True)
     assert by_default.name == "ad-drawn" and by_default.details and by_default.details["sampled"] is True
     assert greedy.name == "ad-drawn (greedy)" and greedy.details and "sampled" not in greedy.details
     assert find_agent("ad-drawn", acting="exact", greedy=None).name == "ad-drawn"
     assert find_agent(str(trained_run), greedy=False).name == "AD+mlp (sampled)"
-    assert run_cli("models").endswith("(source noise), draws its actions\n")
     with pytest.raises(UnknownNameError, match=r"unknown acting 'exat'.*Did you mean 'exact'"):
         find_agent(trained_run, acting="exat")  # type: ignore[arg-type]
 
@@ -114,7 +113,6 @@ def test_models_in_the_package_are_small_and_loadable_and_have_cards():
     for model in bundled_models(MODELS).values():
         assert model.role and re.search(r", M [+-]\d.* on tracks teammate and layout, M", scores[model.name])
         assert (MODELS / model.name / MODEL_CARD).is_file()
-        assert model.sampled == (model.name != "ad-reference")
         agent = find_agent(model.name)
         for track, folder in model.runs.items():
             size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

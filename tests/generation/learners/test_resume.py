@@ -91,15 +91,18 @@ def test_changing_xla_threads_after_jax_was_used_raises_error(monkeypatch):
 
 @pytest.mark.slow
 def test_xla_threads_are_limited_if_jax_was_not_used_yet():
-    """Count the threads that XLA starts in a new process."""
+    """Count the threads that XLA starts in a new process. With one thread, a call returns when its result is ready."""
     script = (
-        "import os, jax; from icrl4aht_generation.learners.resume import limit_xla_threads, xla_threads\n"
-        "limit_xla_threads({0}); jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((500, 500))))\n"
+        "import os, jax\n"
+        "from icrl4aht_generation.learners.resume import limit_xla_threads, xla_threads\n"
+        "limit_xla_threads({0}); found = jax.jit(lambda x: x @ x @ x @ x)(jax.numpy.ones((1500, 1500)))\n"
+        "ready = found.is_ready(); jax.block_until_ready(found)\n"
         "names = [open(f'/proc/self/task/{{task}}/comm').read() for task in os.listdir('/proc/self/task')]\n"
-        "print(xla_threads(), sum('XLAEigen' in name for name in names))"
+        "print(xla_threads(), sum('XLAEigen' in name for name in names), ready)"
     )
     for threads in (1, 3):
-        assert run_python("-c", script.format(threads)).split() == [str(threads)] * 2
+        found = run_python("-c", script.format(threads)).split()
+        assert found == [str(threads), str(threads), str(threads == 1)]
 
 
 class TestStateFile:

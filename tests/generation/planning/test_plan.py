@@ -60,11 +60,17 @@ def test_cost_of_noise_histories_includes_no_learners(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("profile", "hours", "size"), [("teach", 1057 / 3600, 447_144_160), ("billion", 2753 / 3600, 2_168_576_928)]
+    ("profile", "histories", "hours", "size"),
+    [("teach", 56, 1057 / 3600, 447_144_160), ("billion", 318, 2753 / 3600, 2_168_576_928)],
 )
-def test_plan_states_time_and_size_of_scripted_profiles_as_measured(profile, hours, size):
-    """The measured values are those of complete runs on two cores."""
-    found = plan.estimate_cost(load_profile(profile), devices=1)
+def test_plan_states_time_and_size_of_scripted_profiles_as_measured(tmp_path, profile, histories, hours, size):
+    """The measured values are those of complete runs on two cores, before the profiles had `all_dishes`."""
+    counts = f"histories = {histories}\nepisodes = 100\n"
+    path = tmp_path / "measured.toml"
+    path.write_text(
+        f'base = "{profile}"\n[search]\n{counts}[search.layouts.rooms-0-46]\n{counts}[tasks]\nall_dishes = false\n'
+    )
+    found = plan.estimate_cost(load_profile(str(path)), devices=1)
     assert found["hours_on_one"] == pytest.approx(hours, rel=0.05)
     assert found["lite_bytes"] == pytest.approx(size, rel=0.05)
 
