@@ -162,7 +162,7 @@ def reference_command(
     out: Path,
     queue: dict[str, Any],
 ) -> None:
-    """Make reference models, and the releases that they are trained on.
+    """Make reference models, and the data that they are trained on.
 
     Generates a release if the model needs one, trains one model for each track or for all tracks, and evaluates it. The
     same command resumes a stopped run. rl2-reference learns by playing with training teammates. rl2-adapting starts
