@@ -168,9 +168,9 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
 def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Layout], Policy]:
     """Return a function from a layout to the policy of a trained model.
 
-    The function raises OptionError with the name of `folder` if the layout's observations do not have the shape that
-    the model was trained on. A model with canonical channels plays on every layout whose ingredients all have a
-    canonical channel; for other layouts the function raises OptionError, too.
+    The function raises OptionError with the name of `folder` if the model cannot play on the layout. A model that sees
+    a layout's own channels needs observations of the shape that it was trained on. A model that sees canonical channels
+    needs ingredients that have canonical channels.
     """
     policy = trained_policy(run.method, run.params, run.context, mode)
 
